@@ -17,20 +17,20 @@ from gmem_jax.sweeps.sweep import FREE_CORES, SweepRunner, seconds_of
 
 
 class Cost(NamedTuple):
-    """What there is to do of a sweep.
+    """The work that is left of a sweep.
 
     Attributes:
-        points: that are asked for, each once.
-        there: of these, results that are there.
-        failed: that failed before, or cannot be.
-        packs: to be made first.
-        runs: of what is missing; points on packs to be made count by themselves.
-        grain_steps: of all that.
-        seconds: that it takes two free cores, with the native backend and law H.
-        disk_bytes: that its results take.
-        damaged: of those that are there, or another point's: they are computed again.
-        others: results in the folder that are not asked for, and stay.
-        begun: runs in the folder that are unfinished, and are gone on with.
+        points: number of points of the sweep, each counted once.
+        there: number of points whose results are in the folder.
+        failed: number of points that failed before or are impossible.
+        packs: number of packs to be made first.
+        runs: largest number of runs for the missing points; each point on a pack to be made counts as one.
+        grain_steps: grain-steps of all these packs and runs.
+        seconds: time that they take on two free cores, with the native backend and law H.
+        disk_bytes: size of their results.
+        damaged: number of results that are damaged or belong to another point; they are computed again.
+        others: number of results in the folder of points that are not asked for; they stay.
+        begun: number of unfinished runs in the folder, which are continued.
     """
 
     points: int
@@ -47,7 +47,7 @@ class Cost(NamedTuple):
 
     @property
     def lines(self) -> list[str]:
-        """In words."""
+        """The estimate as lines of text."""
         counts = [f"{self.there} there", *([f"{self.failed} failed or impossible"] if self.failed else [])]
         found = {
             f"{plural(self.damaged, 'file')} damaged, or another point's: to be computed again": self.damaged,
@@ -64,11 +64,11 @@ class Cost(NamedTuple):
 
 
 def cost_of(spec: Spec, folder: Path, *, workers: int = 1, only_packs: bool = False) -> Cost:
-    """What is to be done of a sweep, or for its packs alone, in a folder, which need not be there and is not made.
+    """The work that is left of a sweep, or of its packs only, in a folder; it need not exist, and is not made.
 
     Raises:
         FileFormatError: if the folder holds something else.
-        ValueError: if a point cannot be (see `SweepRunner.check`).
+        ValueError: if a point is impossible (see `SweepRunner.check`).
         FileNotFoundError: if there is no such pack.
     """
     with TemporaryDirectory() as nowhere:

@@ -13,12 +13,12 @@ Rows = Sequence[Mapping[str, Any]]
 
 
 class Axes(NamedTuple):
-    """What the names of a sweep are in a picture.
+    """The roles of the names of a sweep in a picture.
 
     Attributes:
-        x: the horizontal axis.
-        by: a line for each set of their values.
-        over: means and standard errors are over these.
+        x: the name along the horizontal axis.
+        by: names with a line for each combination of their values.
+        over: names over which means and standard errors are taken.
     """
 
     x: str
@@ -30,9 +30,9 @@ class Line(NamedTuple):
     """A line of a picture.
 
     Attributes:
-        values: of the names that it stands for.
-        x: where its points are, in order.
-        each: the measures there.
+        values: the values, by name, that its points have in common.
+        x: the places of its points, in order.
+        each: the measures at each place.
     """
 
     values: dict[str, Any]
@@ -41,37 +41,38 @@ class Line(NamedTuple):
 
     @property
     def mean(self) -> np.ndarray:
-        """Of the measures at each x."""
+        """Mean of the measures at each x."""
         return np.asarray([spread(values)[0] for values in self.each])
 
     @property
     def error(self) -> np.ndarray:
-        """Their standard errors; NaN of single ones."""
+        """Standard error of the mean at each x; NaN where there is one measure."""
         return np.asarray([spread(values)[2] for values in self.each])
 
     @property
     def most(self) -> int:
-        """The largest number of them at an x."""
+        """The largest number of measures at an x."""
         return max(map(len, self.each))
 
 
 def is_sample(name: str) -> bool:
-    """Whether a name only tells samples of one thing apart, as packs and seeds do."""
+    """Whether a name only numbers random samples, as "pack" and seeds do."""
     return name == "pack" or name.rpartition(".")[2] == "seed"
 
 
 def axes_of(rows: Rows, names: Sequence[str], x: str = "", by: Sequence[str] = (), over: Sequence[str] = ()) -> Axes:
-    """What every name is, where some are chosen. Parameters are averaged into one another only if that is asked for.
+    """The role of every name, of which some may be chosen. Only samples are averaged over unless `over` says otherwise.
 
     Args:
-        rows: of the points that are done.
-        names: that the sweep varies.
-        x: default the first number that is no sample, else the first name that is none, else the first sample.
-        by: default all that vary and are nothing else, and do not follow from x.
+        rows: rows of the points that are done.
+        names: names that the sweep varies.
+        x: default the first name with numbers that is not a sample, else the first that is not, else the first sample.
+        by: default all other names that vary and do not follow from x.
         over: default the samples (`is_sample`).
 
     Raises:
-        ValueError: for a name that does not vary, or is two things, or nothing though others are chosen.
+        ValueError: for a chosen name that does not vary or has two roles; or if `by` is chosen and another name that
+            varies has no role.
     """
     chosen = [*([x] if x else []), *by, *over]
     varying = [name for name in names if len({row[name] for row in rows}) > 1]
@@ -95,12 +96,12 @@ def axes_of(rows: Rows, names: Sequence[str], x: str = "", by: Sequence[str] = (
 
 
 def _follows(rows: Rows, name: str, x: str) -> bool:
-    """Whether each value of x has one of another name, as in a [[zip]]."""
+    """Whether each value of x goes with one value of another name, as in a [[zip]]."""
     return len({(row[x], row[name]) for row in rows}) == len({row[x] for row in rows})
 
 
 def lines_of(rows: Rows, axes: Axes, measure: str) -> list[Line]:
-    """The lines of a picture, each in the order of x; points without x are in none."""
+    """The lines of a picture, each in the order of x; points without an x are left out."""
     there = [row for row in rows if row[axes.x] is not None]
     numbers = all(is_number(row[axes.x]) for row in there)
     found: dict[tuple[Any, ...], dict[Any, dict[Any, float]]] = {}

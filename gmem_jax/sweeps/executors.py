@@ -1,6 +1,6 @@
 """Executors of the jobs of a sweep: processes on this machine, or SLURM.
 
-An executor keeps workers alive as long as jobs are left that nobody has; the workers find their jobs in the store.
+An executor keeps workers alive as long as there are unfinished jobs; the workers find their jobs in the store.
 """
 
 import itertools
@@ -21,10 +21,10 @@ from gmem_jax.sweeps.processes import EXIT_TIMEOUT, RUNNER, job_name, known_by, 
 from gmem_jax.sweeps.store import Store
 
 POLL = 0.5  # s
-DEATHS = 3  # of workers one after the other, none of which got farther than those before, that end a sweep
-CORES = 8  # of a worker: more gain little at N = 325
-THREADS = "GMEM_THREADS"  # of the environment: threads of a process
-TIMEOUTS = 1000  # of a job that is put into the queue again each time
+DEATHS = 3  # a sweep ends when all workers have died so often without any progress in between
+CORES = 8  # CPUs of a worker: more gain little at N = 325
+THREADS = "GMEM_THREADS"  # environment variable: threads of a process
+TIMEOUTS = 1000  # times that a job may run out of its time and be queued again
 
 
 class Executor(ABC):
@@ -32,7 +32,7 @@ class Executor(ABC):
 
     workers: int
     waiting: str = ""
-    """What workers that have not begun wait for, in brackets."""
+    """The reason why workers have not begun, in brackets."""
 
     @abstractmethod
     def start(self, store: Store, name: str) -> None:
@@ -44,18 +44,18 @@ class Executor(ABC):
 
     @abstractmethod
     def alive(self) -> set[str]:
-        """The names of the workers that run, or wait for their turn."""
+        """The names of the workers that run or are queued."""
 
     @abstractmethod
     def stop(self) -> None:
         """Stop all workers."""
 
     def finish(self, store: Store, jobs: list[dict[str, Any]], told: Callable[[float], None]) -> None:
-        """See that jobs are done; `told` is given the fraction of their work that is.
+        """Keep workers running until the jobs are done; `told` is called with the fraction of their work that is done.
 
         Raises:
             RunFailedError: if workers die again and again.
-            OSError: if none can be started.
+            OSError: if a worker cannot be started.
         """
         names = [f"worker-{number}" for number in range(min(self.workers, max(1, len(jobs))))]
         total = sum(job["work"] for job in jobs) or 1.0
@@ -71,7 +71,7 @@ class Executor(ABC):
                 told(now / total)
                 if not open_:
                     return
-                if now > furthest:  # a worker whose time is over, say, has not died in vain
+                if now > furthest:  # there was progress before a worker ended, as at the end of its time
                     deaths, furthest = 0, now
                 alive = self.alive()
                 if not alive and not any(store.taken(job) for job in open_):
@@ -90,7 +90,7 @@ class Executor(ABC):
                 store.erase(name)
 
     def said(self, store: Store) -> str:
-        """What the workers said."""
+        """The output of the workers."""
         return store.logs()
 
     def _last_words(self, store: Store) -> str:
@@ -99,23 +99,23 @@ class Executor(ABC):
 
 
 def cores() -> list[int]:
-    """The CPUs that this process may use, or as many of them as the quota of its container keeps busy."""
+    """The CPUs that this process may use; not more of them than the quota of its container allows."""
     own = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)
     return sorted(own)[: cpus()]
 
 
 def threads(cpus: int) -> str:
-    """The threads of a worker with so many CPUs: one on each, or fewer if GMEM_THREADS asks for fewer."""
+    """Number of threads of a worker with `cpus` CPUs, as a text: one on each, or fewer if GMEM_THREADS says so."""
     told = os.environ.get(THREADS, "")
     more = told.isdecimal() and int(told) > cpus
-    return told if told and not more else str(cpus)  # the worker refuses what is no number
+    return told if told and not more else str(cpus)  # if it is not a number, the worker refuses it
 
 
 class Processes(Executor):
     """Worker processes on this machine, each on CPUs of its own.
 
     Args:
-        workers: how many; default one for every eight CPUs.
+        workers: number of workers; default one for every eight CPUs.
 
     Raises:
         ValueError: if there are fewer CPUs than workers.
@@ -144,11 +144,11 @@ class Processes(Executor):
         store.record(name, known_by(started.pid))
 
     def alive(self) -> set[str]:
-        """The names of those that have not ended."""
+        """The names of the workers that have not ended."""
         return {name for name, process in self._running.items() if process.poll() is None}
 
     def stop(self) -> None:
-        """End them all, also those that do not listen; their checkpoints stay."""
+        """End all workers, also those that ignore a signal; their checkpoints stay."""
         for process in self._running.values():
             if process.poll() is None:
                 process.terminate()
@@ -168,11 +168,11 @@ class Submitted(Executor):
 
     Args:
         cluster: "slurm", or "local" for submitit's own processes.
-        workers: how many; default 1.
-        options: of submitit's executor, like slurm_partition, timeout_min (60), cpus_per_task (1), mem_gb.
+        workers: number of workers; default 1.
+        options: options of submitit's executor, like slurm_partition, timeout_min (60), cpus_per_task (1), mem_gb.
 
     Raises:
-        ValueError: if submitit is not installed, the scheduler cannot be reached, or an option is none of its.
+        ValueError: if submitit is not installed, the scheduler cannot be reached, or submitit has no such option.
     """
 
     def __init__(self, cluster: str, workers: int | None = None, options: dict[str, Any] | None = None) -> None:
@@ -192,7 +192,7 @@ class Submitted(Executor):
             raise ValueError(f"options of submitit: {str(error).splitlines()[0]}") from None
 
     def _submitting(self, logs: Path) -> Any:
-        """Submitit's executor; NameError or AssertionError if an option is none of its, or cannot be."""
+        """Submitit's executor; it raises NameError or AssertionError for an unknown option or an impossible value."""
         safe = {"slurm_python": " ".join(map(shlex.quote, python())), "slurm_max_num_timeout": TIMEOUTS}
         made = self._submitit.AutoExecutor(logs, cluster=self._cluster, local_max_num_timeout=TIMEOUTS, **safe)
         made.update_parameters(**self._options)
@@ -205,7 +205,7 @@ class Submitted(Executor):
                 self._executor = self._submitting(store.folder / "workers" / "submitit")
             if "name" not in self._options:
                 self._executor.update_parameters(name=job_name(store, name))
-            with safe_path(), stderr_into(store.log_of(name)):  # a local controller that is ended leaves a traceback
+            with safe_path(), stderr_into(store.log_of(name)):  # a controller prints a traceback at its end
                 job = self._executor.submit(work.Requeued(), [str(store.folder.absolute()), name])
         except (self._submitit.core.utils.FailedJobError, subprocess.SubprocessError, FileNotFoundError) as error:
             raise OSError(f"the scheduler takes no job: {' '.join(str(error).split())[-300:]}") from error
@@ -214,11 +214,11 @@ class Submitted(Executor):
         store.record(name, known_by(int(job.job_id)) if here else {"slurm": job.job_id, "name": job_name(store, name)})
 
     def said(self, store: Store) -> str:
-        """What the workers said, as far as submitit finds it."""
+        """The output of the workers, as far as submitit finds it."""
         return "\n".join(text for job in self._jobs.values() for text in (job.stdout(), job.stderr()) if text)
 
     def alive(self) -> set[str]:
-        """The names of those that have not ended."""
+        """The names of the workers that have not ended."""
         if self._cluster != "slurm" or not self._jobs:
             return {name for name, job in self._jobs.items() if not job.done(force_check=True)}
         queued = slurm.queue([str(job.job_id) for job in self._jobs.values()])
@@ -229,7 +229,7 @@ class Submitted(Executor):
         return {name for name, job in self._jobs.items() if str(job.job_id) in queued}
 
     def stop(self) -> None:
-        """End them all; their checkpoints stay."""
+        """End all workers; their checkpoints stay."""
         alive = self.alive()
         for name, job in self._jobs.items():
             if name in alive:
@@ -237,7 +237,7 @@ class Submitted(Executor):
 
 
 def _srun(options: dict[str, Any]) -> list[str]:
-    """What srun is told: since SLURM 22.05 it does not take the CPUs of a task from its job."""
+    """Arguments of srun, with the CPUs of a task: since SLURM 22.05 srun does not take them from its job."""
     told = options.get("slurm_srun_args", [])
     told = shlex.split(told) if isinstance(told, str) else list(told)
     known = any(one.startswith(("--cpus-per-task", "-c")) for one in told)
@@ -246,7 +246,7 @@ def _srun(options: dict[str, Any]) -> list[str]:
 
 
 def _warning(options: dict[str, Any]) -> int:
-    """Seconds before the end of its time at which a job is told to keep what it has; SLURM may be a minute early."""
+    """Seconds before the end of a job's time at which it is told to write a checkpoint; SLURM may be a minute early."""
     try:
         return int(max(5.0, min(90.0, 60.0 * float(options.get("slurm_time", options["timeout_min"])) / 4.0)))
     except (TypeError, ValueError):
@@ -257,10 +257,10 @@ KINDS = ("processes", "slurm", "local")
 
 
 def require_options(kind: str, options: dict[str, Any]) -> None:
-    """Refuse what is no executor, and options that it would not look at; what submitit takes is seen when it is made.
+    """Refuse an unknown executor, and options for one without any; submitit's own are checked when it is made.
 
     Raises:
-        ValueError: naming one.
+        ValueError: naming the executor or the option.
     """
     if kind not in KINDS:
         raise ValueError(f"executor must be {', '.join(KINDS[:-1])} or {KINDS[-1]}, got {kind!r}")
@@ -272,7 +272,7 @@ def executor(kind: str, workers: int | None, options: dict[str, Any]) -> Executo
     """An executor by name.
 
     Raises:
-        ValueError: if there is none of that name, it cannot be had here, or GMEM_THREADS is no number of threads.
+        ValueError: if there is no such executor, it cannot run here, or GMEM_THREADS is not a number of threads.
     """
     require_threads()
     require_options(kind, options)

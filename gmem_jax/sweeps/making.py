@@ -15,9 +15,9 @@ from gmem_jax.preparation.recipe import Recipe, graded, grain_steps
 from gmem_jax.sweeps.plan import digest
 from gmem_jax.sweeps.spec import PREPARE
 
-GRAIN = {"shape": "tetra", "overlap": 0.6}  # of packs to be made, where nothing else is said
-FOLLOW = ("delta0", "wall_rigidity")  # of an experiment that its pack is prepared with
-AS_THEY_ARE = "packs_as_they_are"  # in [run]: experiments on packs that were prepared otherwise are wanted
+GRAIN = {"shape": "tetra", "overlap": 0.6}  # default grain of packs to be made
+FOLLOW = ("delta0", "wall_rigidity")  # parameters of an experiment with which its pack is prepared, too
+AS_THEY_ARE = "packs_as_they_are"  # in [run]: allow packs that were prepared with other values of these
 
 
 def clump_of(shape: Mapping[str, Any]) -> grain.Clump:
@@ -26,11 +26,11 @@ def clump_of(shape: Mapping[str, Any]) -> grain.Clump:
 
 
 def recipe_of(values: Mapping[str, Any], *, follow: bool = True) -> tuple[Recipe, dict[str, Any], Material]:
-    """How the pack of a point is made, of which grain and material.
+    """The recipe, the grain and the material with which the pack of a point is made.
 
     Args:
-        values: of the point, those of [prepare] with its prefix. These are asked for by themselves, and come first.
-        follow: whether numbers of the experiment that belong to the preparation (`FOLLOW`) are those of the recipe.
+        values: values of the point; those of [prepare] have its prefix, and override those of the experiment.
+        follow: whether the parameters `FOLLOW` of the experiment are used for the preparation, too.
 
     Raises:
         ValueError: for an unknown name or an impossible value.
@@ -58,14 +58,14 @@ def pack_job(values: Mapping[str, Any], *, follow: bool = True) -> dict[str, Any
 
 
 def require_prepared(experiment: Experiment, pack: str) -> None:
-    """Refuse an experiment on a pack that was prepared for another one.
+    """Refuse an experiment on a pack that was prepared with other values of `FOLLOW`.
 
     Args:
         experiment: the experiment.
-        pack: what the sweep calls its pack.
+        pack: name of its pack in the sweep.
 
     Raises:
-        ValueError: saying what differs, and the ways.
+        ValueError: saying which value differs, and what can be done.
     """
     own = experiment.pack
     asked = {"delta0": experiment.compression, "wall_rigidity": experiment.material.wall_rigidity}
@@ -79,7 +79,7 @@ def require_prepared(experiment: Experiment, pack: str) -> None:
 
 
 def _prepared_with(pack: Pack) -> dict[str, float]:
-    """What is known of `FOLLOW` of a pack: an imported one says nothing of walls."""
+    """The values of `FOLLOW` with which a pack was prepared; an imported pack has no rigidity of walls."""
     material = pack.info.get("material")
     walls = {} if material is None else {"wall_rigidity": float(material["wall_rigidity"])}
     return {"delta0": float(pack.delta0), **walls}

@@ -13,7 +13,7 @@ from gmem_jax.experiment.record import key_of_run, to_dict
 from gmem_jax.experiment.run import default_batch, steps_of_grains
 from gmem_jax.experiment.several import match
 
-ABREAST = 64  # replicas of a run at most: whole vectors of every CPU, and enough for every thread
+ABREAST = 64  # most replicas of a run: whole vectors on every CPU, and enough for every thread
 
 
 @dataclass(frozen=True)
@@ -21,9 +21,9 @@ class Point:
     """An experiment of a sweep.
 
     Attributes:
-        values: what makes it different from the others, by name.
-        experiment: all of it.
-        key: of everything that its numbers depend on.
+        values: the values by name that differ between points.
+        experiment: the experiment.
+        key: hash of everything that its numbers depend on.
     """
 
     values: dict[str, Any]
@@ -36,12 +36,12 @@ class Job:
     """Points that are run together.
 
     Attributes:
-        name: of the job: a hash of its points.
-        points: their keys.
-        configurations: their experiments as written.
-        batch: signals that run together, where there is one point.
-        replicas: side by side.
-        work: grain-steps.
+        name: name of the job, a hash of its points.
+        points: keys of the points.
+        configurations: their experiments in written form.
+        batch: number of signals that run together, if there is one point.
+        replicas: number of replicas side by side.
+        work: number of grain-steps (one grain, one step, one replica).
     """
 
     name: str
@@ -52,22 +52,22 @@ class Job:
     work: float
 
     def asdict(self) -> dict[str, Any]:
-        """As JSON."""
+        """The job as a dictionary that JSON can hold."""
         return {"kind": "run", **asdict(self)}
 
 
 def digest(value: Any) -> str:
-    """Twenty letters that stand for a JSON value."""
+    """A hash of a JSON value, in twenty hexadecimal digits."""
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:20]
 
 
 def point(values: Mapping[str, Any], experiment: Experiment) -> Point:
-    """A point of a sweep."""
+    """A point of a sweep, with its key."""
     return Point(dict(values), experiment, digest(key_of_run(experiment)))
 
 
 def groups(points: Sequence[Point], abreast: int, memory: int) -> Iterator[list[Point]]:
-    """Points that may run side by side, in order, with so many replicas and so much memory at most."""
+    """Groups of points that may run side by side, with at most `abreast` replicas and half of `memory` bytes each."""
     open_: list[list[Point]] = []
     for one in points:
         for group in open_:
@@ -93,20 +93,20 @@ def job(group: Sequence[Point], memory: int) -> Job:
 
 
 def _found_anywhere(configuration: dict[str, Any]) -> dict[str, Any]:
-    """A written experiment whose pack a worker finds in whichever folder it runs."""
+    """A written experiment with an absolute path to its pack, so that workers in any folder find it."""
     of_pack = configuration["pack"]
     path = Path(of_pack["source"])
     return {**configuration, "pack": {**of_pack, "source": str(path.absolute())}} if path.is_file() else configuration
 
 
 def plan(points: Sequence[Point], done: set[str], memory: int, *, workers: int = 1) -> list[Job]:
-    """The jobs that compute what is missing, the longest first; each point once, however often it is asked for.
+    """The jobs for the missing points, the longest first. A point that occurs several times is computed once.
 
     Args:
-        points: of the sweep.
+        points: points of the sweep.
         done: keys of points that need not be computed.
-        memory: of one worker, in bytes.
-        workers: that there will be: runs are kept small enough for each to have one.
+        memory: memory of one worker, in bytes.
+        workers: number of workers; runs are kept small enough that each worker gets one.
     """
     missing = list({one.key: one for one in points if one.key not in done}.values())
     replicas = sum(one.experiment.replicas for one in missing)

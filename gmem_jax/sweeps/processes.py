@@ -15,19 +15,19 @@ from gmem_jax.sweeps import slurm
 from gmem_jax.sweeps.store import Store
 
 EXIT_TIMEOUT = 10.0  # s for a process to end by itself, before it is killed
-RUNNER = "runner"  # whose workers they are
+RUNNER = "runner"  # name of the process that started the workers
 SAFE = {"PYTHONSAFEPATH": "1"}
-"""Environment of Python processes that somebody else starts for us; see `python`."""
+"""Environment of Python processes that another program starts for us; see `python`."""
 
 
 def python(*more: str) -> list[str]:
-    """The command of a Python process of ours: a file in the working folder is never taken for a library (-P)."""
+    """The command of a Python process of ours; with -P it never imports a file of the working folder as a library."""
     return [sys.executable, "-P", *more]
 
 
 @contextlib.contextmanager
 def safe_path() -> Iterator[None]:
-    """Have the processes that are started in the block, by whomever, follow the rule of `python`."""
+    """Let all Python processes that are started in the block follow the rule of `python`."""
     before = {name: os.environ.get(name) for name in SAFE}
     os.environ.update(SAFE)
     try:
@@ -42,7 +42,7 @@ def safe_path() -> Iterator[None]:
 
 @contextlib.contextmanager
 def stderr_into(log: Path) -> Iterator[None]:
-    """Have the processes that are started in the block, by whomever, write to the end of a log what goes to stderr."""
+    """Let all processes that are started in the block append their stderr to a log."""
     kept = os.dup(2)
     try:
         with log.open("ab") as file:
@@ -54,7 +54,7 @@ def stderr_into(log: Path) -> Iterator[None]:
 
 
 def end_with_parent() -> None:
-    """End this process as soon as its parent is no more: however that ended, the pipe to our stdin is closed then."""
+    """End this process as soon as its parent has ended: the pipe to our stdin is then closed, whatever the reason."""
 
     def wait() -> None:
         while os.read(0, 1):
@@ -65,14 +65,14 @@ def end_with_parent() -> None:
 
 
 def known_by(number: int) -> dict[str, Any]:
-    """What tells a process apart from all others, whenever they ran."""
+    """The identity of a process: host, number and start, since numbers are used again."""
     return {"host": platform.node(), "pid": number, "born": psutil.Process(number).create_time()}
 
 
 def _process(who: dict[str, Any], folder: Path) -> psutil.Process | None:
-    """The process of a record, if it runs on this machine and has a file of that very folder open.
+    """The process of a record, if it runs on this machine and has a file of this folder open.
 
-    A folder that was copied, or made by somebody else, may hold records of processes that work elsewhere.
+    A folder that was copied, or made by another user, may hold records of processes that work elsewhere.
     """
     try:
         found = psutil.Process(int(who["pid"]))
@@ -84,7 +84,7 @@ def _process(who: dict[str, Any], folder: Path) -> psutil.Process | None:
 
 
 def end(found: psutil.Process) -> None:
-    """End a process and its children: by TERM, by KILL what does not listen, as one that was stopped."""
+    """End a process and its children: by TERM, then by KILL those that still run, such as stopped ones."""
     with contextlib.suppress(psutil.Error):
         family = [found, *found.children(recursive=True)]
         found.terminate()
@@ -95,10 +95,10 @@ def end(found: psutil.Process) -> None:
 
 
 def stop(store: Store) -> tuple[list[str], list[str]]:
-    """End whoever works on a sweep: its `gmem sweep` first, which would start others.
+    """End all processes and jobs of a sweep: its `gmem sweep` first, which would start new workers.
 
     Returns:
-        What was ended, and what cannot be from here.
+        Two lists of lines: what was ended, and what cannot be ended from here.
     """
     ended, left = [], []
     records = store.records()
@@ -124,12 +124,12 @@ def stop(store: Store) -> tuple[list[str], list[str]]:
 
 
 def job_name(store: Store, worker: str) -> str:
-    """What a worker is called in a queue."""
+    """The name of a worker's job in the queue."""
     return f"gmem-{store.folder.absolute().name}-{worker}"
 
 
 def waiting(store: Store) -> list[str]:
-    """The workers that wait in SLURM's queue, and for what."""
+    """A line for each worker that waits in SLURM's queue, with the reason."""
     jobs = {str(who["slurm"]): worker for worker, who in store.records().items() if "slurm" in who}
     queued = (slurm.queue(list(jobs)) if jobs else None) or {}
     return [f"{jobs[number]} waits ({one.reason})" for number, one in queued.items() if one.state == "PENDING"]

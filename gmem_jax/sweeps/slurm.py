@@ -11,9 +11,9 @@ class Queued(NamedTuple):
     """A job in the queue.
 
     Attributes:
-        state: like PENDING or RUNNING.
-        reason: why it waits.
-        name: of the job.
+        state: state, like PENDING or RUNNING.
+        reason: reason for which the job waits.
+        name: name of the job.
     """
 
     state: str
@@ -22,9 +22,9 @@ class Queued(NamedTuple):
 
 
 def queue(numbers: list[str]) -> dict[str, Queued] | None:
-    """Those of some jobs that run or wait, by number; None if nobody can be asked: jobs outlive their controller.
+    """The jobs among some numbers that run or wait; None if SLURM does not answer, since jobs outlive its controller.
 
-    Asked of the queue: sacct, which submitit asks, needs a data base that small clusters do not have.
+    It asks squeue: sacct, which submitit asks, needs a data base that small clusters do not have.
     """
     command = ["squeue", "--noheader", "--format=%A|%T|%r|%j", f"--jobs={','.join(numbers)}"]
     try:

@@ -44,9 +44,9 @@ class Spec:
 
     Attributes:
         shared: values that all points have, by name.
-        axes: what varies: each axis is some names with as many values each.
+        axes: the axes of the sweep; each is one or more names with lists of values of one length.
         extra: points beyond the combinations of the axes.
-        run: how it is to be done.
+        run: options of `gmem sweep`.
     """
 
     shared: dict[str, Any] = field(default_factory=dict)
@@ -74,7 +74,8 @@ def read_spec(path: Path) -> Spec:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        FileFormatError: if it is no TOML, has an unknown table, or a list that is empty or fits no other.
+        FileFormatError: if it is not TOML, has an unknown table, an empty list, or lists of different length in a
+            [[zip]].
     """
     path = Path(path)
     tables = toml_of(path)
@@ -124,7 +125,7 @@ def spec_of(tables: Mapping[str, Any]) -> Spec:
 
 
 def _values(name: str, value: Any) -> list[Any]:
-    """The values on an axis: a list, or numbers from, to, count, evenly spaced or by equal factors."""
+    """The values on an axis, from a list or from a table of from, to and count: evenly spaced, or by equal factors."""
     if isinstance(value, dict):
         known = {"from", "to", "count", "factors"}
         _require(

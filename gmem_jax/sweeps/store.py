@@ -1,14 +1,14 @@
 """The folder of a sweep: its points and results, failures with their reasons, and workers.
 
     sweep.json         the points: their values and keys, in order; the marker of the folder, see `gmem_jax.files.ours`
-    jobs/              what is to be computed, one file a job
+    jobs/              the jobs to be done, one file each
     points/<key>.h5    recalls, as `gmem recall` writes them; each names its key
-    failed/<key>.json  reasons
+    failed/<key>.json  reasons of failures
     packs/<key>.h5     packs made for this sweep
-    parts/<job>/       unfinished jobs; those that are not put up now with their file
-    workers/           what each worker is doing, what it said, and which process or job it is
+    parts/<job>/       parts of unfinished jobs; and the file of a job that is not in jobs/ now
+    workers/           progress and log of each worker, and its process or SLURM job
 
-A point's key stands for everything that its numbers depend on; what is there need not be computed again.
+A point's key is a hash of everything that its numbers depend on: a result with this key is never computed again.
 """
 
 import contextlib
@@ -30,9 +30,9 @@ from gmem_jax.files.validation import NAME, is_number, source, title, whole
 from gmem_jax.sweeps.plan import Point
 
 SWEEP_MARKER = "sweep.json"
-FREE_BYTES = 1 << 20  # bytes that must be left on the disk: some points of a small pack
-WRITTEN = 3600.0  # s in which a file is surely written: workers write while others look
-JOB = "job.json"  # beside the parts of one that was put aside for others
+FREE_BYTES = 1 << 20  # bytes that must be free on the disk: some points of a small pack
+WRITTEN = 3600.0  # s after which a temporary file was left by a killed writer: workers may be writing younger ones
+JOB = "job.json"  # the file of a job beside its parts, while other jobs are in jobs/
 FOLDERS = ("jobs", "points", "failed", "packs", "parts", "workers")
 _KEY = r"[0-9a-z]{1,40}"
 _JOB = rf"{_KEY}(?:-[0-9]{{1,6}})*"
@@ -46,11 +46,11 @@ class Store:
     """The folder of a sweep.
 
     Args:
-        folder: of the sweep.
-        make: it if it is not there; else nothing in it is touched.
+        folder: the folder.
+        make: whether to make what is missing of it; if not, nothing in it is touched.
 
     Raises:
-        FileFormatError: if it is there and holds something else, or nothing and is not to be made.
+        FileFormatError: if the folder holds something else; or if it holds no sweep and `make` is False.
         OSError: if it cannot be written.
     """
 
@@ -73,20 +73,20 @@ class Store:
         """Write down the points of the sweep; results of points that are no longer asked for stay.
 
         Args:
-            points: that can be computed.
-            shared: the values that all have.
-            names: of what varies.
-            impossible: keys and values of those that cannot.
+            points: the points that can be computed.
+            shared: the values that all points have.
+            names: the names that vary.
+            impossible: keys and values of the points that cannot be computed.
         """
         rows = [{"key": one.key, "values": one.values} for one in points]
         rows += [{"key": key, "values": values} for key, values in impossible]
         self._own.mark({"shared": shared, "names": list(names), "points": rows})
 
     def card(self) -> dict[str, Any]:
-        """What `write_manifest` wrote.
+        """The content of sweep.json, as `write_manifest` wrote it.
 
         Raises:
-            FileFormatError: if there is nothing of the kind.
+            FileFormatError: if there is no such file, or it cannot be read.
         """
         card = Folder.about(self.folder, SWEEP_MARKER, SWEEP.name)
         try:
@@ -124,7 +124,7 @@ class Store:
         return {path.stem for path in self._own.files("points")}
 
     def failed(self) -> dict[str, str]:
-        """Keys of the points that failed, and why."""
+        """The reasons of failures, by key of the point or pack."""
         found = {}
         for path in self._own.files("failed"):
             told = _json(path)
@@ -133,7 +133,7 @@ class Store:
         return found
 
     def save(self, key: str, recall: Recall) -> None:
-        """Keep the recall of a point, which says whose it is."""
+        """Write the recall of a point, with its key."""
         save_recall(self.at(key), recall.described({**recall.configuration, "key": key}))
 
     def load(self, key: str) -> Recall:
@@ -141,7 +141,7 @@ class Store:
 
         Raises:
             FileNotFoundError: if it is not computed.
-            FileFormatError: if its file is damaged, or that of another point.
+            FileFormatError: if its file is damaged, or belongs to another point.
         """
         found = load_recall(self.at(key))
         own = found.configuration.get("key")
@@ -159,7 +159,7 @@ class Store:
         return f"point {printable(key)[:NAME]} ({printable(told)[:NAME]})"
 
     def unreadable(self, keys: set[str]) -> list[str]:
-        """Those of some points that are computed whose files cannot be read."""
+        """The keys, among these, of points whose files exist and cannot be read."""
         found = []
         for key in sorted(keys & self.done()):
             try:
@@ -169,10 +169,10 @@ class Store:
         return found
 
     def require_room(self) -> None:
-        """Make sure that the disk takes more.
+        """Make sure that there is room on the disk.
 
         Raises:
-            OSError: if it does not.
+            OSError: if `FREE_BYTES` cannot be written.
         """
         try:
             with atomic(self._own.at("trial")) as temporary:
@@ -181,7 +181,7 @@ class Store:
             self._own.remove("trial")
 
     def fail(self, key: str, reason: str) -> None:
-        """Write down why a point has no result."""
+        """Write down why a point or a pack failed."""
         self._write(self._failed(key), {"key": key, "reason": reason})
 
     def forget(self, key: str) -> None:
@@ -189,14 +189,14 @@ class Store:
         self._own.remove(f"points/{key}.h5")
 
     def clear_failures(self) -> int:
-        """Forget all failures, so that they are tried again; how many there were."""
+        """Forget all failures, so that they are tried again; gives their number."""
         failed = self._own.files("failed")
         for path in failed:
             self._own.remove(f"failed/{path.name}")
         return len(failed)
 
     def order(self, jobs: Sequence[dict[str, Any]]) -> None:
-        """Put up jobs in the place of those that were there. Of others what was begun stays, to be gone on with."""
+        """Replace the jobs in jobs/. Parts of other unfinished jobs stay with their file, so that these can go on."""
         wanted = {f"{number:05d}-{job['name']}.json": job for number, job in enumerate(jobs)}
         for path in self._own.files("jobs"):
             if path.suffix == ".json" and path.name not in wanted:
@@ -209,29 +209,29 @@ class Store:
             self._write(self._own.at(f"jobs/{name}"), job)
         names = {job["name"] for job in (*jobs, *self._interrupted()) if not self.finished(job)}
         for path in (self.folder / "parts").iterdir():
-            name = path.name.partition("-")[0]  # points of a job that broke are run by themselves, numbered
+            name = path.name.partition("-")[0]  # if a job fails, its points are run one by one, in numbered parts
             if re.fullmatch(_JOB, path.name) and name not in names and not self.taken({"name": name}):
                 self._own.clear(f"parts/{path.name}")
 
     def _interrupted(self) -> list[dict[str, Any]]:
-        """Jobs of which there are parts, and which are not put up."""
+        """Jobs that have parts, and are not in jobs/."""
         folders = (path for path in (self.folder / "parts").glob("*") if re.fullmatch(_JOB, path.name))
         found = (_job(self._own.at(f"parts/{path.name}/{JOB}"), path.name) for path in folders if not path.is_symlink())
         return [job for job in found if job]
 
     def jobs(self) -> list[dict[str, Any]]:
-        """The jobs that were put up, in order; what is none is passed over."""
+        """The jobs in jobs/, in order; files that do not hold a job are passed over."""
         found = (_job(path, path.stem.partition("-")[2]) for path in self._own.files("jobs"))
         return [job for job in found if job]
 
     def begun(self, keys: set[str]) -> list[dict[str, Any]]:
-        """Unfinished runs of some points that a worker is at, or was: they go on as they were begun."""
+        """Unfinished runs whose points are all among `keys`, and that a worker has begun; they go on as they are."""
         jobs = {job["name"]: job for job in (*self.jobs(), *self._interrupted())}.values()
         runs = [job for job in jobs if job["kind"] == "run" and keys.issuperset(job["points"])]
         return [job for job in runs if not self.finished(job) and (self.parts(job).is_dir() or self.taken(job))]
 
     def finished(self, job: dict[str, Any]) -> bool:
-        """Whether nothing is left to do of a job."""
+        """Whether all points of a job, or its pack, are computed or have failed."""
         if job["kind"] == "pack":
             return self.pack_at(job["name"]).is_file() or self._failed(job["name"]).is_file()
         return all(self.at(key).is_file() or self._failed(key).is_file() for key in job["points"])
@@ -240,32 +240,32 @@ class Store:
         return self._own.at(f"failed/{key}.json")
 
     def parts(self, job: dict[str, Any]) -> Path:
-        """Where the unfinished parts of a job are kept."""
+        """The folder of the parts of an unfinished job."""
         return self._own.at(f"parts/{job['name']}/{JOB}").parent
 
     @contextlib.contextmanager
     def lock(self, job: dict[str, Any]) -> Iterator[None]:
-        """Have a job to oneself: the operating system lets go of it when this process dies.
+        """Lock a job; the operating system releases the lock when this process dies.
 
         Raises:
-            FileFormatError: if another living process has it.
+            FileFormatError: if another living process holds the lock.
         """
         own = self._own.at(f"jobs/{job['name']}")
         with locked(own, f"{self.folder}: another sweep computes these points; call again when it is done"):
             yield
 
     def taken(self, job: dict[str, Any]) -> bool:
-        """Whether a living process has a job."""
+        """Whether a living process holds the lock of a job."""
         return is_locked(self._own.at(f"jobs/{job['name']}"))
 
     def tell(self, worker: str, job: str, fraction: float, what: str) -> None:
-        """Say what a worker is doing."""
-        # Not flushed to the disk: it is said again within seconds.
+        """Write down the progress of a worker."""
+        # Not flushed to the disk: it is written again within seconds.
         with atomic(self._own.at(f"workers/{worker}.json"), flush=False) as temporary:
             temporary.write_text(json.dumps({"job": job, "fraction": fraction, "what": what}), encoding="utf-8")
 
     def progress(self) -> list[dict[str, Any]]:
-        """What the workers said last; what is no such record is passed over."""
+        """The latest progress of each worker; other files are passed over."""
         said = (_json(path) for path in self._own.files("workers") if path.suffix == ".json")
         fits = {"job": title, "fraction": is_number, "what": title}
         return [one for one in said if all(name in one and fit(one[name]) for name, fit in fits.items())]
@@ -275,23 +275,23 @@ class Store:
         self._write(self._own.at(f"workers/{worker}.run"), who)
 
     def held(self, worker: str) -> BinaryIO:
-        """The record of this very process, open as long as it works: `processes.stop` ends no other."""
+        """The record of this process, opened: `processes.stop` ends only processes that have such a file open."""
         return self._own.at(f"workers/{worker}.run").open("rb")
 
     def records(self) -> dict[str, dict[str, Any]]:
-        """What `record` wrote, by worker."""
+        """The records that `record` wrote, by worker."""
         return {path.stem: _json(path) for path in self._own.files("workers") if path.suffix == ".run"}
 
     def erase(self, worker: str) -> None:
-        """Remove what `record` wrote of a worker that has ended."""
+        """Remove the record of a worker that has ended."""
         self._own.remove(f"workers/{worker}.run")
 
     def log_of(self, worker: str) -> Path:
-        """The file of what a worker says."""
+        """The log file of a worker."""
         return self._own.at(f"workers/{worker}.log")
 
     def logs(self) -> str:
-        """What the workers with such files said, who said something last at the end."""
+        """The text of all log files; the one that was written last is at the end."""
         logs = [path for path in self._own.files("workers") if path.suffix == ".log"]
         return "\n".join(
             path.read_text(encoding="utf-8", errors="replace")
@@ -300,7 +300,7 @@ class Store:
 
 
 def _json(path: Path) -> dict[str, Any]:
-    """A JSON object from a file; an empty one if there is none."""
+    """A JSON object from a file; an empty one if the file does not hold one."""
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
@@ -309,7 +309,7 @@ def _json(path: Path) -> dict[str, Any]:
 
 
 def _job(path: Path, name: str) -> dict[str, Any] | None:
-    """The job of that name in a file; None if it is none."""
+    """The job of that name in a file; None if the file does not hold it."""
     job = _json(path)
     sizes = all(is_number(job.get(one)) for one in ("work", "replicas"))
     if job.get("name") != name or not sizes:

@@ -41,15 +41,15 @@ from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.work import parts_of_job, run_group
 
 FREE_CORES = "of two free cores once compiled (native, law H)"
-SECONDS_PER_GRAIN_STEP = STEP_SECONDS["native"][1]  # of SIDE_BY_SIDE replicas; see docs/scaling.md
-SIDE_BY_SIDE = 8  # replicas: a block
+SECONDS_PER_GRAIN_STEP = STEP_SECONDS["native"][1]  # with SIDE_BY_SIDE replicas; see docs/scaling.md
+SIDE_BY_SIDE = 8  # replicas of a block
 CHECKED = 50  # values of a name that are tried before a sweep begins
 ANY_PACK = "tetra-325-a"
 Tell = Callable[[str], None]
 
 
 class Result(NamedTuple):
-    """A point of a sweep and what it gave back."""
+    """The values of a point of a sweep, and its recall."""
 
     values: dict[str, Any]
     recall: Recall
@@ -137,7 +137,7 @@ def sweep(
 
 
 def _labels(values: Sequence[Any]) -> list[Any]:
-    """Values as a table shows them: different ones of one name (packs, laws of one kind) are numbered."""
+    """Values for a table; different objects of one name, as packs or laws of one kind, are numbered."""
     labels = [_label(value) for value in values]
     objects = {id(value): value for value, label in zip(values, labels, strict=True) if isinstance(label, str)}
     own = {key: identity(value) for key, value in objects.items()}
@@ -161,22 +161,22 @@ def _label(value: Any) -> Any:
 
 
 def seconds_of(jobs: Sequence[Mapping[str, Any]], cost: float = SECONDS_PER_GRAIN_STEP) -> float:
-    """How long jobs take, from their work and replicas, at a cost of a grain-step with `SIDE_BY_SIDE` replicas."""
+    """Seconds that jobs take, from work and replicas; `cost` is that of a grain-step at `SIDE_BY_SIDE` replicas."""
     blocks: float = sum(job["work"] * work_of_bin(job["replicas"]) / job["replicas"] for job in jobs)
     return cost * blocks * SIDE_BY_SIDE / work_of_bin(SIDE_BY_SIDE)
 
 
 class SweepRunner:
-    """A sweep as a file asks for it, done by workers on a store.
+    """The sweep of a file, run by workers on a store.
 
     Args:
-        spec: what is asked for.
-        folder: of its store.
-        say: told in a line what is planned, and what happened.
-        cost: seconds a grain-step with `SIDE_BY_SIDE` replicas, for that.
+        spec: the content of the file.
+        folder: folder of the store.
+        say: called with lines of text on what is planned and what happened.
+        cost: seconds per grain-step with `SIDE_BY_SIDE` replicas, for the announced times.
 
     Raises:
-        FileFormatError: if what is asked for of packs is neither true nor false.
+        FileFormatError: if packs_as_they_are in [run] is neither true nor false.
     """
 
     def __init__(self, spec: Spec, folder: Path, say: Tell, *, cost: float = SECONDS_PER_GRAIN_STEP) -> None:
@@ -191,7 +191,7 @@ class SweepRunner:
 
     @functools.cached_property
     def store(self) -> Store:
-        """The store, made on first use: a sweep that is refused leaves nothing behind.
+        """The store. It is made on first use, so that a sweep that is refused leaves nothing behind.
 
         Raises:
             FileFormatError: if the folder holds something else.
@@ -202,7 +202,7 @@ class SweepRunner:
         return pack_job(values, follow=not self.as_they_are)
 
     def pack_jobs(self) -> list[dict[str, Any]]:
-        """The packs that must be made first.
+        """The jobs of the packs that must be made first.
 
         Raises:
             ValueError: for an impossible recipe.
@@ -217,9 +217,10 @@ class SweepRunner:
         return [job for name, job in wanted.items() if name not in failed and not self.store.pack_at(name).is_file()]
 
     def check(self) -> None:
-        """Refuse a sweep before anything is computed: some points with every value are made, on some pack if need be.
+        """Refuse an impossible sweep before anything is computed, by making the experiments of some of its points.
 
-        What is impossible only together with another value fails later, by itself.
+        They take up to `CHECKED` values of every name in turn, on a shipped pack if their own does not exist yet. A
+        point that is impossible only by a combination of values fails later, by itself.
 
         Raises:
             ValueError: for an unknown name or an impossible value.
@@ -249,15 +250,15 @@ class SweepRunner:
         return found
 
     def pack_of(self, values: Mapping[str, Any]) -> Pack:
-        """The pack of a point, if it is made.
+        """The pack of a point.
 
         Args:
-            values: of the point, the shared ones too.
+            values: values of the point, the shared ones included.
 
         Raises:
             RunFailedError: if it could not be made.
-            FileNotFoundError: if there is no such pack.
-            FileFormatError: if its file is damaged, or that of another pack.
+            FileNotFoundError: if there is no such pack, or it is not made yet.
+            FileFormatError: if its file is damaged, or belongs to another pack.
         """
         if "pack" in values:
             return self._packs(str(values["pack"]))
@@ -278,7 +279,7 @@ class SweepRunner:
 
         Raises:
             RunFailedError: if one could not be made, or workers die again and again.
-            OSError: if none can be started.
+            OSError: if no worker can be started.
             FileNotFoundError: if there is no such pack.
         """
         if makes := self.pack_jobs():
@@ -287,7 +288,7 @@ class SweepRunner:
         return [self.pack_of({**self.spec.shared, **values}) for values in self.spec.combinations()]
 
     def points(self) -> list[Point]:
-        """All points that are possible, once their packs are there."""
+        """All possible points, once their packs exist; the others are put into `impossible` with their reasons."""
         found = []
         self.impossible = []
         for values in self.spec.combinations():
@@ -299,11 +300,11 @@ class SweepRunner:
         return found
 
     def run(self, executor: Executor, progress: Progress) -> None:
-        """Do all that is missing.
+        """Make all packs and run all points that are missing.
 
         Raises:
             RunFailedError: if workers die again and again.
-            OSError: if none can be started.
+            OSError: if no worker can be started.
         """
         if makes := self.pack_jobs():
             self._announce(f"{plural(len(makes), 'pack')} to be made", makes, executor)
@@ -325,7 +326,7 @@ class SweepRunner:
         begun = self.store.begun({one.key for one in points} - set(self.store.failed()))
         under_way = {key for job in begun for key in job["points"]}
         jobs = begun + [job.asdict() for job in plan(points, known | under_way, memory, workers=executor.workers)]
-        keys = {one.key for one in points}  # some may be written in several ways
+        keys = {one.key for one in points}  # several points may have one key
         kept, told = len(keys & known), plural(len(keys), "point")
         if jobs:
             count = sum(len(job["points"]) for job in jobs)
@@ -335,13 +336,13 @@ class SweepRunner:
             self.say(f"nothing to do: {kept} of {told} there")
 
     def points_to_come(self) -> list[dict[str, Any]]:
-        """What will be run on packs that do not exist yet: work, replicas and bytes of each point by itself."""
+        """Work, replicas and bytes of each point on a pack that does not exist yet."""
         found = []
         for values in self.spec.combinations():
             all_ = {**self.spec.shared, **values}
             if "pack" in all_ or self.store.pack_at((job := self._pack_job(all_))["name"]).is_file():
                 continue
-            with contextlib.suppress(ValueError, FileNotFoundError):  # an impossible point is told of in its turn
+            with contextlib.suppress(ValueError, FileNotFoundError):  # an impossible point is reported later
                 like = self._experiment(all_, self._packs(ANY_PACK))
                 grains = job["recipe"]["grains"]
                 work = grains * like.timing.steps * replica_bins(like, like.signals.count)

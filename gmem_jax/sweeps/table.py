@@ -28,16 +28,16 @@ TABLE_FORMATS = (".csv", ".parquet", ".h5", ".nc")
 
 
 def rows(store: Store) -> list[dict[str, Any]]:
-    """A row for each point of a sweep, in its order: what varies, the measures, status.
+    """A row for each point of a sweep, in order: the names that vary, the measures, and the status.
 
-    Points that are not computed yet have the state "open", those that failed "failed" and their reason. Where a
-    protocol has several reads or channels a point has a row for each, and all have the names "read" and "channel".
+    The state of a point is "done", "failed" with a reason, or "open" if it is not computed yet. If a point has several
+    reads or channels, it has a row for each, and all rows of the table have the names "read" and "channel".
 
     Raises:
         FileFormatError: if there is no sweep, or a result is damaged.
     """
     card, failed = store.card(), store.failed()
-    found: list[tuple[dict[str, Any], dict[str, Any], dict[str, Any]]] = []  # what varies; of which part; the rest
+    found: list[tuple[dict[str, Any], dict[str, Any], dict[str, Any]]] = []  # names that vary; read and channel; others
     for point in card["points"]:
         key = point["key"]
         row: dict[str, Any] = {name: _cell(point["values"].get(name)) for name in card["names"]}
@@ -60,7 +60,7 @@ def rows(store: Store) -> list[dict[str, Any]]:
 
 
 def names_in(table: Sequence[Mapping[str, Any]], names: Sequence[str]) -> list[str]:
-    """What tells the rows of a sweep apart: the names that vary, and read and channel where there are several."""
+    """The names that distinguish the rows of a sweep: those that vary, and read and channel if there are several."""
     return [*names, *(part for part in READ_AND_CHANNEL if part not in names and any(part in row for row in table))]
 
 
@@ -70,7 +70,7 @@ def points_in(table: Sequence[_Row]) -> list[_Row]:
     seen: set[Any] = set()
     for row in table:
         part = tuple(row.get(name) for name in READ_AND_CHANNEL)
-        if not found or row.get("key") != found[-1].get("key") or part in seen:  # a point may be asked for twice
+        if not found or row.get("key") != found[-1].get("key") or part in seen:  # a point may occur twice
             found.append(row)
             seen = set()
         seen.add(part)
@@ -78,17 +78,17 @@ def points_in(table: Sequence[_Row]) -> list[_Row]:
 
 
 def result_of(row: Mapping[str, Any]) -> tuple[Any, ...]:
-    """What a row is of: a mean counts each result once, though its point may be asked for in several ways."""
+    """The identity of a row's result: means count each result once, though several points may have it."""
     return row["key"], *(row.get(name) for name in READ_AND_CHANNEL)
 
 
 def warnings_of(row: Mapping[str, Any]) -> str:
-    """Why a point that is done is doubtful, from its row: its status and what was warned of; "" if nothing is."""
+    """Why the result of a row is doubtful: its status and the warnings of its run; "" if it is not."""
     return "; ".join(filter(None, (row["why"], row["warnings"]))) if row["state"] == "done" else ""
 
 
 def doubts(table: Sequence[Mapping[str, Any]]) -> list[str]:
-    """How many points are doubtful, and why: a line for each reason. One that is asked for in several ways is one."""
+    """A line for each reason why results are doubtful, with their number; points with one key count once."""
     points = {row["key"]: row for row in points_in(table)}
     counts = Counter(reason for row in points.values() if (reason := warnings_of(row)))
     return [f"{count} of {plural(len(points), 'point')}: {reason}" for reason, count in counts.items()]
@@ -99,7 +99,7 @@ def _cell(value: Any) -> Any:
 
 
 def means(table: Sequence[dict[str, Any]], names: Sequence[str], over: Sequence[str]) -> list[dict[str, Any]]:
-    """Rows that differ only in the names `over` as one: mean, standard deviation and number of each measure."""
+    """One row for all rows that differ only in the names `over`: mean, SD and SE of each measure, and their number."""
     left = [name for name in names if name not in over]
     groups: dict[tuple[Any, ...], dict[Any, dict[str, Any]]] = {}
     for row in table:
@@ -118,13 +118,13 @@ def means(table: Sequence[dict[str, Any]], names: Sequence[str], over: Sequence[
 
 
 def export_table(store: Store, path: Path) -> str:
-    """Write the table: .csv (see `plain_cell`); .parquet; .h5 or .nc, which xarray reads, with every recalled signal.
+    """Write the table as .csv (see `plain_cell`) or .parquet; or, with all recalled signals, as .h5 or .nc for xarray.
 
     Returns:
-        What is to be known of it; "" if nothing.
+        A remark on the file for the user; "" if there is none.
 
     Raises:
-        ValueError: for another suffix, or if a library is missing.
+        ValueError: for another suffix, a sweep without points, or if a library is missing.
         OSError: if it cannot be written.
     """
     suffix = path.suffix.lower()

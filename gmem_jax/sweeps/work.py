@@ -1,11 +1,11 @@
-"""A worker: takes jobs that nobody has, until none is left.
+"""A worker: takes jobs that no other worker has, until none is left.
 
     python -P -m gmem_jax.sweeps.work FOLDER NAME [CPUS [attached]]
 
-An attached one ends as soon as its stdin does.
+An attached worker ends as soon as its stdin is closed.
 
-Any number of workers, on any machines that see the folder, share a sweep; one that is killed loses what it did since
-its last checkpoint.
+Any number of workers, on any machines that see the folder, share a sweep. A worker that is killed loses its work since
+the last checkpoint.
 """
 
 import contextlib
@@ -44,7 +44,7 @@ from gmem_jax.sweeps.store import Store
 
 ATTACHED = "attached"
 REPORT_INTERVAL = 1.0  # s between two reports of progress
-WARNED = "warnings"  # in the configuration of a point: what Python warned of in its run, and the status does not say
+WARNED = "warnings"  # in the configuration of a point: warnings of its run that the status does not include
 
 
 def run_group(
@@ -56,7 +56,7 @@ def run_group(
     cache: Checkpoints | None = None,
     progress: Progress = silent,
 ) -> dict[str, Recall]:
-    """Run points that match each other, and keep their recalls in a store; the recalls by key.
+    """Run points that match each other, and write their recalls into a store, if any; gives the recalls by key.
 
     Raises:
         RunFailedError: if the simulation broke down.
@@ -69,7 +69,7 @@ def run_group(
             else:
                 recalls = run_several(experiments, cache=cache or no_cache, progress=progress)
     finally:
-        for one in heard:  # they are of the log too, or of who called
+        for one in heard:  # pass them on to the log or the caller
             warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
     if store:
         for key, experiment, recall in zip(keys, experiments, recalls, strict=True):
@@ -81,14 +81,14 @@ def run_group(
 
 
 def parts_of_job(store: Store, job: dict[str, Any]) -> Checkpoints:
-    """The unfinished parts of a job; those of another batch are discarded."""
+    """The parts of an unfinished job; parts with another batch are discarded."""
     key, advice = {"job": job["name"], "batch": job.get("batch")}, "remove it, and do the sweep with --retry"
     folder = store.parts(job)
     return Checkpoints(folder, key, restart=bool(Checkpoints.other_run(folder, key)), advice=advice)
 
 
 def warned(heard: Sequence[warnings.WarningMessage]) -> list[str]:
-    """The texts of warnings, each once, but for those that are said of each point by itself."""
+    """The texts of warnings, each once, without those of delta0 and gravity, which each point gets by itself."""
     own = (OtherCompressionWarning, OtherGravityWarning)
     texts = [" ".join(str(one.message).split()) for one in heard if one.category not in own]
     return list(dict.fromkeys(texts))
@@ -108,13 +108,13 @@ class _Worker:
         return tell
 
     def do(self, job: dict[str, Any]) -> None:
-        """Do a job; a broken run is written down as failed, with its reason."""
+        """Do a job; if its run fails, write the reason down."""
         keys = [job["name"]] if job["kind"] == "pack" else job["points"]
         try:
             (self._prepare if job["kind"] == "pack" else self._run)(job)
         except (RunFailedError, ValueError, FileNotFoundError) as error:
             reason = " ".join(str(error).split())
-            if len(keys) > 1:  # one of them broke: the others may be sound
+            if len(keys) > 1:  # one of the points failed; the others may be sound
                 self._one_by_one(job)
             else:
                 self.store.fail(keys[0], reason)
@@ -149,7 +149,7 @@ class _Worker:
 
 
 def work(folder: Path, name: str) -> int:
-    """Take jobs until none is left that nobody has; how many were done.
+    """Take jobs until none is left that no other worker has; gives the number of jobs done.
 
     Raises:
         FileFormatError: if the folder holds no sweep.
@@ -169,7 +169,7 @@ def work(folder: Path, name: str) -> int:
 
 
 class Requeued:
-    """A worker as submitit's job: before its time is over it keeps a checkpoint, and is put into the queue again."""
+    """A worker as a job of submitit: before its time is over it writes a checkpoint and is queued again."""
 
     def __call__(self, arguments: list[str]) -> int:
         """Work."""
@@ -178,12 +178,12 @@ class Requeued:
         return run_worker(arguments)
 
     def checkpoint(self, arguments: list[str]) -> Any:
-        """The same again, for submitit."""
+        """The same job again, for submitit to queue."""
         return importlib.import_module("submitit.helpers").DelayedSubmission(self, arguments)
 
 
 def run_worker(arguments: list[str]) -> int:
-    """Entry point of a worker's process; 0 if it did what it could."""
+    """Entry point of a worker's process; gives its exit code, 0 if all jobs were tried."""
     if ATTACHED in arguments[3:]:
         end_with_parent()
     jax.config.update("jax_enable_x64", True)
