@@ -23,12 +23,12 @@ class Curve:
     Attributes:
         x: places, [n].
         y: values, [n].
-        name: in the legend, where a name stands once; "" for none.
-        colour: of the line.
+        name: entry in the legend, which has each name once; "" for none.
+        colour: colour of the line.
         style: "-", "--", ":", "-."; "o" for points, "o-" for points on a line, "." for small and faint points.
-        width: of the line, in points.
+        width: width of the line, in points.
         band: lowest and highest values, [2, n], filled in the same colour.
-        errors: up and down from each value, [n], drawn as bars.
+        errors: half lengths of error bars, [n].
     """
 
     x: np.ndarray
@@ -43,16 +43,16 @@ class Curve:
 
 @dataclass(frozen=True)
 class Image:
-    """Values of a grid.
+    """Values on a grid, drawn as colours.
 
     Attributes:
-        values: [rows, columns].
+        values: the values, [rows, columns].
         x: centres of the columns, equally far apart, [columns].
         y: centres of the rows, [rows].
-        label: of the colours.
-        limits: where the colours begin and end; default symmetric about zero.
-        colours: a map that matplotlib and plotly know.
-        written: whether each value that is not zero stands in its cell.
+        label: label of the colour bar.
+        limits: lowest and highest value of the colours; default symmetric about zero.
+        colours: name of a colour map of both matplotlib and plotly.
+        written: whether each value above zero is written into its cell.
     """
 
     values: np.ndarray
@@ -65,20 +65,20 @@ class Image:
 
     @property
     def range(self) -> tuple[float, float]:
-        """Where the colours begin and end."""
+        """Lowest and highest value of the colours."""
         most = float(np.nanmax(np.abs(self.values), initial=0.0)) or 1.0
         return self.limits or (-most, most)
 
 
 @dataclass(frozen=True)
 class Discs:
-    """Discs, the later before the earlier; in pictures only.
+    """Discs, each drawn over the ones before it; in pictures only, not on pages.
 
     Attributes:
-        places: of the centres, [n, 2].
-        values: what they are coloured by, [n].
-        label: of the colours.
-        radii: of the discs, [n].
+        places: centres of the discs, [n, 2].
+        values: values that give their colours, [n].
+        label: label of the colour bar.
+        radii: radii of the discs, [n].
     """
 
     places: np.ndarray
@@ -89,26 +89,26 @@ class Discs:
 
 @dataclass(frozen=True)
 class Panel:
-    """What stands in one frame.
+    """A panel: marks in one pair of axes.
 
     Attributes:
-        marks: what is drawn, the later before the earlier.
-        title: over it.
-        x: label of the axis.
-        y: label of the axis.
-        x_limits: where it begins and ends; default where the marks do.
-        y_limits: the same of y.
+        marks: curves, images and discs, each drawn over the ones before it.
+        title: title above the panel.
+        x: label of the horizontal axis.
+        y: label of the vertical axis.
+        x_limits: ends of the horizontal axis; default those of the marks.
+        y_limits: ends of the vertical axis; default those of the marks.
         log: whether y is logarithmic.
         whole: whether ticks of x are whole numbers.
         zero: whether there is a line at y = 0.
         down: whether y grows downwards.
         equal: whether x and y have one scale.
-        x_names: of the places 0, 1, ...
-        y_names: the same of y.
-        spans: parts of x with names: begin, end, name.
-        behind: an area behind the marks with an axis of its own on the right, from 0 to its y.
-        behind_label: of that axis.
-        behind_limit: where it ends, up and down.
+        x_names: names of the places x = 0, 1, ...
+        y_names: names of the places y = 0, 1, ...
+        spans: named parts of x, each with begin, end and name.
+        behind: a curve drawn as an area from 0, behind the marks, with an axis of its own on the right.
+        behind_label: label of that axis.
+        behind_limit: highest value of that axis; the lowest is its negative.
     """
 
     marks: tuple[Curve | Image | Discs, ...]
@@ -131,7 +131,7 @@ class Panel:
 
     @property
     def curves(self) -> list[Curve]:
-        """Those of its marks that are."""
+        """The curves among its marks."""
         return [mark for mark in self.marks if isinstance(mark, Curve)]
 
 
@@ -141,12 +141,13 @@ class Figure:
 
     Attributes:
         panels: the panels.
-        columns: panels in a row.
-        size: of a picture, in inches.
-        title: lines over it.
-        legend: "panel": in the first panel; "below" or "right": one of all panels; "" for none.
-        legend_title: over the legend.
-        shared: axes that all panels have in common, "x" and "y"; "row": y in each row. They are labelled at the edges.
+        columns: number of panels in a row.
+        size: size of a picture, in inches.
+        title: lines above the picture.
+        legend: place of the legend: "panel", in the first panel; "below" or "right" of all panels; "" for none.
+        legend_title: title of the legend.
+        shared: axes that all panels share, "x" and "y"; "row" if the panels of a row share y. They are labelled at the
+            edges of the figure only.
     """
 
     panels: tuple[Panel, ...]
@@ -159,34 +160,34 @@ class Figure:
 
     @property
     def rows(self) -> int:
-        """Rows of panels."""
+        """Number of rows of panels."""
         return -(-len(self.panels) // self.columns)
 
     def labelled(self, number: int) -> tuple[bool, bool]:
-        """Whether x and y of a panel have labels: of shared axes, only those at the edges of the figure."""
+        """Whether x and y of a panel have labels; shared axes have them at the edges of the figure only."""
         edge = number + self.columns >= len(self.panels), number % self.columns == 0
         return edge[0] or "x" not in self.shared, edge[1] or not {"y", "row"} & set(self.shared)
 
 
 def ramp(count: int) -> list[str]:
-    """So many colours from blue to red."""
+    """`count` colours from blue to red."""
     return [f"#{round(255 * tone):02x}4d{round(255 * (1.0 - tone)):02x}" for tone in np.linspace(0.0, 1.0, count)]
 
 
 def grid(count: int) -> tuple[int, tuple[float, float]]:
-    """Columns of so many panels of signals, and the size of their picture in inches."""
+    """Number of columns for `count` panels of signals, and the size of their picture in inches."""
     columns = min(count, 3) if count <= 12 else min(8, math.ceil(math.sqrt(count)))
     width, height = (3.4, 2.4) if count <= 12 else (2.1, 1.7)
     return columns, (max(width * columns, 5.0) + 0.4, height * -(-count // columns) + 0.9)
 
 
 def u_label(columns: int, *, of_time: bool = False) -> str:
-    """What is written under an axis of u, or of the time of a read: a word where panels are narrow."""
+    """Label of an axis of u, or of the time of a read; a single word if there are many narrow columns."""
     if columns <= 3:
         return TIME_OF_READ if of_time else U
     return "time" if of_time else "u"
 
 
 def shown_part(shown: int, count: int) -> str:
-    """What is said where not all signals have panels."""
+    """A remark for a title if only some of the signals are shown; else ""."""
     return f" (the first {shown} of {count} signals are shown)" if shown < count else ""

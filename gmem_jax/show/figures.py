@@ -27,10 +27,10 @@ def lines_figure(lines: Mapping[str, tuple[Any, Any]], x: str, y: str, title: st
 
     Args:
         lines: places and values by name.
-        x: label of the axis.
-        y: label of the axis.
-        title: over it.
-        more: of the `Panel`.
+        x: label of the horizontal axis.
+        y: label of the vertical axis.
+        title: title above the panel.
+        more: further fields of the `Panel`.
     """
     curves = tuple(
         Curve(np.asarray(place, float), np.asarray(values, float), name, f"C{number % 10}", "o-")
@@ -40,7 +40,7 @@ def lines_figure(lines: Mapping[str, tuple[Any, Any]], x: str, y: str, title: st
 
 
 def grains_figure(pack: Pack) -> Figure:
-    """The spheres of all grains, seen along z; the higher, the brighter."""
+    """The spheres of all grains, seen from above along z; higher ones are brighter."""
     still = jnp.zeros((*pack.position.shape, 1))
     grains = Grains(pack.position[..., None], pack.quaternion[..., None], still, still, still, still)
     centres = np.asarray(sphere_centres(grains, pack.clump))[..., 0]
@@ -81,7 +81,7 @@ def bumps_figure(kernel: MemoryKernel, title: str, modulus: float = PASCAL) -> F
 
 
 def confusion_figure(counts: Mapping[str, np.ndarray]) -> Figure:
-    """Words read for words stored, by what stands over it; counts [S, S], the word stored down, as parts of rows."""
+    """Confusion matrices by title, from counts [stored word, read word]; each row is divided by its sum."""
     panels = []
     for title, table in counts.items():
         count = len(table)
@@ -104,7 +104,7 @@ def bits_figure(readers: Mapping[str, Any], title: str) -> Figure:
 
 
 def gradient_figure(places: Sequence[Sequence[float]], slopes: Sequence[Sequence[float]], title: str = "") -> Figure:
-    """dF / da of every signal's heights against where in u they act: places and slopes of each signal."""
+    """Derivatives dF / da by the heights a of each signal, against the places in u where these act."""
     rows = enumerate(zip(places, slopes, strict=True), 1)
     lines = {f"signal {number}": row for number, row in rows}
     return lines_figure(lines, U, "dF / d amplitude", title, zero=True)
@@ -117,7 +117,7 @@ def history_figure(histories: Mapping[str, Sequence[float]]) -> Figure:
 
 
 def values_figure(history: Sequence[Mapping[str, float]], title: str) -> Figure:
-    """The values of a tuned drive after every iteration, in parts of the first."""
+    """The values of a tuned drive after every iteration, over the first ones."""
     lines = {
         f"{name}: {first:.3g} to {history[-1][name]:.3g}": (range(len(history)), [one[name] / first for one in history])
         for name, first in history[0].items()
@@ -134,7 +134,7 @@ def weights_figure(weights: np.ndarray, title: str) -> Figure:
 
 
 def waves_figure(signals: Signals, target: Signals | None, title: str = "") -> Figure:
-    """I(u) of waveforms, and of those whose recall they imitate."""
+    """I(u) of waveforms, and of the targets of their design, if there are any."""
     u = np.linspace(0.0, 1.0, 2 * BINS + 1)
     names, waves = names_of(signals), np.asarray(signals.shear(jnp.asarray(u))).T
     wanted = None if target is None else np.asarray(target.shear(jnp.asarray(u))).T
@@ -150,12 +150,12 @@ def waves_figure(signals: Signals, target: Signals | None, title: str = "") -> F
 
 
 def design_figure(design: Design, unit: float, title: str) -> Figure:
-    """Designed waveforms, and their recall beside the targets and what the untouched waveforms gave.
+    """Designed waveforms, and their recalls beside the targets and the recalls of the original waveforms.
 
     Args:
-        design: the design, of S signals; of several channels some of each are shown.
+        design: the design of S signals; at most six are shown, some of each channel.
         unit: delta0 gamma0.
-        title: over the picture.
+        title: title above the picture.
     """
     channels, bins = len(design.sets), design.target.shape[-1]
     gain = np.diag(np.atleast_2d(design.gain))[:, None, None]

@@ -40,8 +40,8 @@ def _number(cell: str) -> str | float:
 def summary(recall: Recall) -> dict[str, Any]:
     """The numbers of one recall, for JSON output and `recall_table`.
 
-    Of several reads and channels the measures are lists, as in the recall; "each" has the numbers of one each, and
-    "gains" its row of the gain matrix, by the channel that was written on.
+    With several reads or channels the measures are lists, as in the recall. "each" then has the numbers of every read
+    and channel, with "gains", its row of the gain matrix by the channel that was written on.
     """
     parts = [*recall.each()]
     rows = [_summary(one) for one in parts]
@@ -76,11 +76,11 @@ _OF_READ = (
     "target_gain",
     "target_fidelity",
 )
-"""What a `summary` has for each read and channel."""
+"""Fields that a `summary` has for each read and channel."""
 
 
 def status_words(status: int) -> list[str]:
-    """The set bits of a status, each in a word or two."""
+    """The names of the set bits of a status, in lower case."""
     return [str(bit.name).lower().replace("_", " ") for bit in Status if status & bit]
 
 
@@ -118,7 +118,7 @@ def _summary(recall: Recall) -> dict[str, Any]:
 
 
 def note_on_size(configuration: dict[str, Any]) -> str:
-    """What to bear in mind of a pack of this grain and size, though nothing is wrong with the run; "" for most."""
+    """A note on packs of few spheres, which remember little although the run is sound; "" for other packs."""
     grains = configuration["grains"]
     if configuration.get("grain", {}).get("shape") != "sphere" or grains >= LARGE_FOR_SPHERES:
         return ""
@@ -129,7 +129,7 @@ def note_on_size(configuration: dict[str, Any]) -> str:
 
 
 def _signals(recall: Recall) -> list[dict[str, Any]]:
-    """What is said of each signal by itself."""
+    """The measures of each signal by itself."""
     measures = of_each(recall)
     rows = zip(recall.names, *(values.tolist() for values in measures.values()), strict=True)
     return [
@@ -142,7 +142,7 @@ def _known(value: float) -> float | None:
 
 
 def of_target(recall: Recall, configuration: dict[str, Any]) -> dict[str, Any]:
-    """Gain and fidelity with respect to the J that the waveforms were designed for; {} for waveforms that were not."""
+    """Gain and fidelity with respect to the J of the design's target; {} if the waveforms were not designed."""
     if "target" not in configuration:
         return {}
     wanted = bin_average(signals_from_dict(configuration["target"]))
@@ -151,9 +151,9 @@ def of_target(recall: Recall, configuration: dict[str, Any]) -> dict[str, Any]:
 
 
 def second_readout(recall: Recall, configuration: dict[str, Any]) -> dict[str, Any]:
-    """Every background's gain and fidelity, and what the second readout still holds; {} for a run without one.
+    """Gain and fidelity with every background, and the memory that the second readout still finds; {} without one.
 
-    "second_readout" has mean and standard error over the S signals of the correlation with J and of the gain. Words
+    "second_readout" has mean and standard error, over the S signals, of its correlation with J and of its gain. Words
     are sums of few bits, so that their errors are not independent: the spread over packs is the better measure.
     """
     if recall.second_readout is None:

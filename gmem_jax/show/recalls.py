@@ -21,14 +21,14 @@ from gmem_jax.show.figure import Curve, Figure, Image, Panel, grid, shown_part, 
 from gmem_jax.show.render_matplotlib import Drawing, to_matplotlib
 from gmem_jax.show.stages import AGAINST, QUANTITIES, ZERO, observed_quantities, stages_figure
 
-MOST_PANELS = 64  # panels of one picture
-MOST_OF_PAGE = 12  # panels of a page
+MOST_PANELS = 64  # most panels of a picture
+MOST_OF_PAGE = 12  # most panels of a figure of a page
 MEAN, PALE = "its mean over the ringing period $T_1$", "#a9c6e6"
 SHEAR = r"$I(u) = \gamma / \gamma_0$"
 
 OF_SIGNALS = ("signals", "waveforms", "all")
 PICTURES = (*OF_SIGNALS, *QUANTITIES)
-"""What can be drawn of a recall."""
+"""Names of the pictures of a recall."""
 
 
 def plot(
@@ -75,7 +75,7 @@ def recall_figure(
         recall: the recall.
         what: one of `PICTURES`, or "observed:NAME".
         against: "time" or "u", for the stages.
-        signals: numbers of those to draw.
+        signals: numbers of the signals to draw; default all.
 
     Raises:
         ValueError: if there is no such picture, or no such signal.
@@ -119,17 +119,17 @@ def recall_figure(
 
 
 def place_of(recall: Recall, one: Recall) -> str:
-    """Which of the reads and channels of a recall one is of, as ", second, xy"; "" if there are no others."""
+    """The read and channel of `one`, a part of a recall, as ", second, xy"; each is named only if there are several."""
     several = [name for name in ("reads", "channels") if len(getattr(recall, name)) > 1]
     return "".join(f", {getattr(one, name)[0]}" for name in several)
 
 
 def joined_figure(parts: Sequence[tuple[str, Figure]], title: str) -> Figure:
-    """Figures of each read and channel as one of at most 64 panels; what each is of stands in its title.
+    """Join the figures of all reads and channels into one of at most 64 panels, whose titles name read and channel.
 
     Args:
-        parts: where each belongs, and its figure.
-        title: over all.
+        parts: pairs of a name, of read and channel, and a figure.
+        title: title above all.
     """
     first, most = parts[0][1], max(1, MOST_PANELS // len(parts))
     panels = [
@@ -152,11 +152,11 @@ def _refuse_unknown(signals: Sequence[int], count: int, lowest: int) -> None:
 
 
 def mean_over_ringing(recall: Recall, signals: np.ndarray, t0: Any) -> np.ndarray | None:
-    """Signals [S, 256] averaged over the ringing period; None at the paper's rate, or an unknown one.
+    """Signals [S, 256] after a running mean over the ringing period; None if t0 is the paper's or longer, or unknown.
 
     Args:
-        recall: whose ringing period it is.
-        signals: p_sig, by any background.
+        recall: the recall, for its ringing period.
+        signals: p_sig, with any background.
         t0: duration of one compression, in t_c.
     """
     if not is_number(t0) or t0 >= PAPER_T0 or not np.isfinite(recall.window):
@@ -176,17 +176,17 @@ def signals_figure(
 ) -> Figure:
     """p_sig of every signal, its scaled integral, and the waveform, like the paper's Fig. 6; at most 64 panels.
 
-    Faster than the paper's rate the drive rings: the mean over the ringing period is drawn over what was recalled.
+    If t0 is shorter than the paper's, the pack rings: the running mean over the ringing period is drawn, too.
 
     Args:
-        recall: what to draw.
-        names: of its S signals.
-        title: over the picture.
-        scale: delta0 gamma0, scalar or [S, 1]; without it the integral that comes nearest is drawn, which is the same
-            where all signals have one scale.
+        recall: the recall.
+        names: names of its S signals.
+        title: title above the picture.
+        scale: delta0 gamma0, scalar or [S, 1]; without it J is fitted to p_sig, which is the same if all signals have
+            one scale.
         t0: duration of one compression in t_c, if it is known and the same for all.
-        target: J that designed waveforms should give, [S, 256].
-        page: whether it is for a page: at most 12 panels, without the waveforms.
+        target: J of the targets of designed waveforms, [S, 256].
+        page: whether the figure is for a page: at most 12 panels, without the waveforms.
     """
     pascal = float(recorded_material(recall.configuration).modulus)
     u, signals, integrals, waves = (np.asarray(x) for x in (recall.u, recall.p_sig, recall.J, recall.shear))
@@ -243,7 +243,7 @@ def waveforms_figure(recall: Recall, names: Sequence[str], title: str) -> Figure
 
 
 def image_figure(recall: Recall, names: Sequence[str], title: str) -> Figure:
-    """p_sig and J of all signals, however many, as a picture: a row for each."""
+    """p_sig and J of all signals as two images with a row for each signal, however many there are."""
     count, u = len(recall.J), np.asarray(recall.u)
     pairs = (
         (

@@ -10,12 +10,12 @@ from gmem_jax.physics.pairs import sphere_offsets
 from gmem_jax.show.render_matplotlib import pyplot, save_picture
 
 VIEW = (np.deg2rad(-35.0), np.deg2rad(25.0))  # azimuth and elevation of the eye
-LIGHT = np.array([-0.4, 0.5, 0.77])  # where it comes from: right, up, towards the eye
-GOLDEN = 0.618034  # hues of grains that follow each other lie this far apart
+LIGHT = np.array([-0.4, 0.5, 0.77])  # direction to the light: right, up, towards the eye
+GOLDEN = 0.618034  # difference of hue between a grain and the next
 
 
 def camera(azimuth: float, elevation: float) -> np.ndarray:
-    """Rows are the directions right, up and towards the eye, [3, 3]."""
+    """The directions right, up and towards the eye, as rows, [3, 3]."""
     (ca, sa), (ce, se) = ((np.cos(angle), np.sin(angle)) for angle in (azimuth, elevation))
     return np.array([[ca, sa, 0.0], [sa * se, -ca * se, ce], [sa * ce, -ca * ce, se]])
 
@@ -30,10 +30,10 @@ def rendered(centres: np.ndarray, colour: np.ndarray, pixels: int = 700, radii: 
     """An image of spheres.
 
     Args:
-        centres: of the spheres, [S, 3].
-        colour: of each, [S, 3], from 0 to 1.
-        pixels: the longer side.
-        radii: of the spheres, [S]; default 1.
+        centres: centres of the spheres, [S, 3].
+        colour: red, green and blue of each sphere, from 0 to 1, [S, 3].
+        pixels: length of the longer side.
+        radii: radii of the spheres, [S]; default 1.
 
     Returns:
         Red, green, blue and opacity, [height, width, 4], the first row on top.
@@ -71,7 +71,7 @@ def pack_image(pack: Pack, pixels: int = 700) -> np.ndarray:
 
 
 def packs_figure(path: Path, packs: Sequence[Pack], title: str, columns: int = 4) -> None:
-    """Packs beside each other, each as large as its panel, with what they are made of.
+    """Write a picture of packs beside each other, each as large as its panel, with size, shape and filling.
 
     Raises:
         OSError: if it cannot be written.

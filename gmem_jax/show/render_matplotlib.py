@@ -23,12 +23,12 @@ _POINTS: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class Drawing:
-    """A picture. A notebook shows it; `figure` is matplotlib's, for whoever wants to change it."""
+    """A picture, which a notebook shows. `figure` is matplotlib's figure, and can be changed."""
 
     figure: Any
 
     def save(self, path: str | Path) -> None:
-        """Write it, in the format of the path's suffix.
+        """Write the picture, in the format of the path's suffix.
 
         Raises:
             OSError: if it cannot be written.
@@ -43,12 +43,12 @@ class Drawing:
         return content.getvalue()
 
     def _write(self, target: Any, **options: Any) -> None:
-        with _without_tex():  # numbers at the axes are made while it is drawn
+        with _without_tex():  # tick labels are made while the figure is drawn
             self.figure.savefig(target, **options)
 
 
 def _without_tex() -> Any:
-    """Have matplotlib write by itself, whatever the user's matplotlibrc says: LaTeX may not be there."""
+    """Keep matplotlib from using LaTeX, whatever the user's matplotlibrc says: it may not be installed."""
     import matplotlib
 
     return matplotlib.rc_context({"text.usetex": False})
@@ -66,13 +66,13 @@ def pyplot() -> Any:
 
 
 def save_picture(path: Path, figure: Any, *, also: Sequence[str] = (), caption: str = "") -> None:
-    """Write a figure of `pyplot` whole, and close it.
+    """Write a figure of `pyplot`, and close it.
 
     Args:
-        path: in the format of its suffix.
-        figure: of matplotlib.
-        also: further suffixes to write it under.
-        caption: what is seen, in words under it.
+        path: the file; its suffix is the format.
+        figure: matplotlib's figure.
+        also: suffixes of further formats to write.
+        caption: a caption below the figure.
 
     Raises:
         OSError: if it cannot be written.
@@ -94,7 +94,7 @@ def to_matplotlib(figure: Figure) -> Drawing:
 
 
 def _canvas(figure: Figure) -> Any:
-    """Matplotlib's figure."""
+    """The figure as matplotlib's."""
     from matplotlib.figure import Figure as Canvas
 
     canvas = Canvas(figsize=figure.size, layout="constrained")
@@ -108,7 +108,7 @@ def _canvas(figure: Figure) -> Any:
     for number, (axis, panel) in enumerate(zip(axes.flat, figure.panels, strict=False)):
         _panel(axis, panel, figure, number)
     if figure.title:
-        width = int(12 * figure.size[0])  # letters of this size in an inch
+        width = int(12 * figure.size[0])  # 12 letters of this size in an inch
         lines = [textwrap.fill(line, width) for line in figure.title if line]
         canvas.suptitle("\n".join(lines), fontsize=9)
     known: dict[str, Any] = {}
@@ -124,7 +124,7 @@ def _legend(canvas: Any, first: Any, figure: Figure, known: dict[str, Any]) -> N
     if figure.legend == "panel":
         first.legend(known.values(), known, **style)
     elif figure.legend == "below":
-        fitting = max(1, int(canvas.get_figwidth() / 2.4))  # inches of an entry
+        fitting = max(1, int(canvas.get_figwidth() / 2.4))  # an entry takes 2.4 inches
         style |= {"fontsize": 8, "ncols": min(len(known), fitting)}
         canvas.legend(known.values(), known, loc="outside lower center", **style)
     else:
@@ -216,7 +216,7 @@ def _spans(axis: Any, panel: Panel) -> None:
 
 
 def _names(axis: Any, panel: Panel, figure: Figure) -> None:
-    """Names of places, as many as there is room for."""
+    """Write the names of places at the ticks, as many as there is room for."""
     for names, inches, ticks in (
         (panel.x_names, figure.size[0] / figure.columns, axis.set_xticks),
         (panel.y_names, figure.size[1] / figure.rows, axis.set_yticks),

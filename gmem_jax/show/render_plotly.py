@@ -36,11 +36,11 @@ def script() -> str:
 
 
 def html(figure: Figure | Mapping[str, Figure], name: str) -> str:
-    """A figure as HTML, for a page that holds `script`.
+    """A figure as HTML, for a page that has `script`.
 
     Args:
-        figure: the figure; or several by what is written on their buttons, alike but for their x.
-        name: of the part of the page.
+        figure: the figure; or several that differ only in x, by the text of their buttons.
+        name: identifier of the part of the page.
     """
     drawn = to_plotly(figure)
     return str(drawn.to_html(full_html=False, include_plotlyjs=False, config=TOLD, div_id=name))
@@ -82,7 +82,7 @@ def to_plotly(figure: Figure | Mapping[str, Figure]) -> Any:
 
 
 def _above(height: int) -> dict[str, Any]:
-    """A place above the panels of a figure of so many pixels."""
+    """A place above the panels of a figure that is `height` pixels high."""
     return {"y": 1.0 + ABOVE / (height - MARGIN["t"] - MARGIN["b"]), "yanchor": "middle"}
 
 
@@ -115,7 +115,7 @@ def _panel(drawn: Any, panel: Panel, figure: Figure, number: int, known: set[str
 
 
 def _common(figure: Figure) -> list[float] | None:
-    """Limits of a y that all panels have in common: plotly finds none."""
+    """Limits of y if all panels share it, since plotly does not find common ones; else None."""
     if "y" not in figure.shared:
         return None
     values = [curve.y for panel in figure.panels for curve in panel.curves]
@@ -160,7 +160,7 @@ def _bands(figure: Figure) -> list[dict[str, Any]]:
 
 
 def _button(label: str, figure: Figure) -> dict[str, Any]:
-    """Another x of all curves, which they have in common, its labels and its bands."""
+    """A button that changes the common x of all curves, its labels and its bands."""
     places = np.float32(figure.panels[0].curves[0].x).round(7).tolist()
     labels = {
         f"xaxis{number + 1 if number else ''}.title.text": _text(panel.x)
@@ -171,14 +171,14 @@ def _button(label: str, figure: Figure) -> dict[str, Any]:
 
 
 def _colour(colour: str) -> str:
-    """As a page says it."""
+    """A colour in HTML."""
     if re.fullmatch(r"[01]\.\d*", colour):
         return "#" + 3 * f"{round(255 * float(colour)):02x}"
     return COLOURS.get(colour, colour)
 
 
 def _text(text: str) -> str:
-    """Formulas in HTML."""
+    """A text with its formulas in HTML."""
 
     def formula(found: re.Match[str]) -> str:
         words = found[1].replace("\\,", " ")

@@ -1,4 +1,4 @@
-"""The self-contained page of `gmem report`, which shows what files hold."""
+"""The self-contained page of `gmem report`, which shows the content of files."""
 
 import functools
 import json
@@ -17,7 +17,7 @@ from gmem_jax.show.summaries import GrainView, Part, Summary, summary_of
 
 _CELL = 300  # characters of a value in a configuration
 _NUMBER = re.compile(r"[-+]?\d[\d.,e±\s+-]*|nan|-|")
-Shown = dict[str, Any]  # what the template is given of a part
+Shown = dict[str, Any]  # the values of a part for the template
 
 
 @functools.cache
@@ -28,26 +28,26 @@ def _template() -> Any:
 
 
 def _safe(html: str) -> Any:
-    """HTML that is ours, which the template leaves as it is."""
+    """HTML of our own, which the template does not escape."""
     return optional("markupsafe", "report").Markup(html)
 
 
 def _cells(head: Sequence[str], rows: Sequence[Sequence[Any]], caption: str = "") -> Shown:
-    """A table; columns of numbers stand to the right."""
+    """A table for the template; columns of numbers are aligned to the right."""
     cells = [["" if cell is None else str(cell) for cell in row] for row in rows]
     right = [all(_NUMBER.fullmatch(cell) for cell in column) for column in zip(*cells, strict=True)]
     return {"head": head, "rows": cells, "right": right, "caption": caption}
 
 
 def _of_rich(drawn: Table) -> Shown:
-    """A table of the terminal."""
+    """A table made for the terminal, for the template."""
     head = [str(column.header) for column in drawn.columns] if drawn.show_header else [""] * len(drawn.columns)
     rows = list(zip(*(map(str, column.cells) for column in drawn.columns), strict=True))
     return {"heading": str(drawn.title or ""), **_cells(head, rows, str(drawn.caption or ""))}
 
 
 def _configuration(values: Mapping[str, Any]) -> Iterator[Shown]:
-    """Every parameter, folded away; long lists are cut."""
+    """A folded table of all parameters; long values are cut."""
 
     def flat(part: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
         for name, value in part.items():
@@ -62,29 +62,32 @@ def _configuration(values: Mapping[str, Any]) -> Iterator[Shown]:
 
 
 def _but_for_its_pack(configuration: Mapping[str, Any]) -> str:
-    """All that makes the experiment of a recall, and size and shape of the grains, so that packs can be compared."""
+    """The experiment of a recall as a text, with number and shape of the grains instead of the pack.
+
+    It is the same for recalls that differ only in their packs.
+    """
     own = {**configuration["experiment"], "pack": [configuration["grains"], configuration["grain"]["shape"]]}
     return json.dumps(own, sort_keys=True)
 
 
 class Report:
-    """A page in the making: sections of files, one after the other.
+    """A page that grows: sections of files, one after the other.
 
     Attributes:
-        sections: title of each, and what is shown in it.
+        sections: title and parts of each section.
     """
 
     def __init__(self) -> None:
         self.sections: list[tuple[str, list[Shown]]] = []
         self._recalls: list[Summary] = []
-        self._seen: set[str] = set()  # packs that are shown at rest
+        self._seen: set[str] = set()  # hashes of the packs that are shown at rest
         self._figures = self._views = 0
 
     def add(self, source: str) -> None:
-        """Add what a file, the folder of a sweep or a shipped pack holds.
+        """Add the content of a file, of the folder of a sweep, or of a shipped pack.
 
         Raises:
-            FileNotFoundError: if there is none.
+            FileNotFoundError: if there is no such file.
             FileFormatError: if it is damaged, or of a kind that no command writes.
         """
         found = summary_of(source)
@@ -117,7 +120,7 @@ class Report:
             return {"text": "Its pack at rest is shown above."}
         try:
             frames = content.frames()
-        except (OSError, ValueError, KeyError) as error:  # the pack of a recall need not be there any more
+        except (OSError, ValueError, KeyError) as error:  # the pack of a recall may be gone
             return {"text": f"Its pack is not shown: {' '.join(str(error).split())}"}
         self._seen |= {content.pack} - {""}
         self._views += 1
@@ -131,7 +134,7 @@ class Report:
         return view.page(title, f"{library}{body}", three=self._views > 0)
 
     def _overview(self) -> list[tuple[str, list[Shown]]]:
-        """Recalls of one experiment on several packs beside each other, with means and standard deviations."""
+        """A table of the recalls, with means and SD, if they are of one experiment on several packs; else nothing."""
         if len(self._recalls) < 2:
             return []
         configurations = [dict(each.configuration) for each in self._recalls]

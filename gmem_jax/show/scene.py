@@ -15,18 +15,18 @@ import numpy as np
 from gmem_jax.physics.material import Material
 from gmem_jax.simulation.frames import Frames, images_met
 
-COLOUR_RANGE = 0.995  # part of all values that a colour bar spans: the few beyond it have the last colour
+COLOUR_RANGE = 0.995  # part of all values that a colour bar spans; the few larger ones have the last colour
 MILLI = 1e3
-_LEVELS = 65535  # of a number in a page: 1e-3 R in a box of 60 R
+_LEVELS = 65535  # steps of a number in a page: 1e-3 R in a box of 60 R
 
 
 @dataclass(frozen=True)
 class Colouring:
-    """What grains are coloured by.
+    """A quantity by which grains are coloured.
 
     Attributes:
-        label: what it is.
-        unit: of the values; "" for a plain number.
+        label: name of the quantity.
+        unit: unit of the values; "" for a plain number.
         values: of every grain in every frame, none below zero, [F, N].
     """
 
@@ -36,7 +36,7 @@ class Colouring:
 
     @property
     def top(self) -> float:
-        """Where the colours end; 1 where all is zero, or nothing is there."""
+        """Highest value of the colours; 1 if all values are zero, or there are none."""
         if not self.values.size:
             return 1.0
         return float(np.quantile(self.values, COLOUR_RANGE)) or float(self.values.max()) or 1.0
@@ -47,9 +47,9 @@ class Links:
     """Forces between grains that touch, of all frames one after the other.
 
     Attributes:
-        start: where those of a frame begin, and where the last end, [F + 1].
-        grains: the two, [L, 2].
-        force: size of the sum over the contacts of their spheres, friction included, [L], in E R^2.
+        start: rows of frame f are start[f] to start[f + 1], [F + 1].
+        grains: numbers of both grains, [L, 2].
+        force: size of their total force, friction included: the sum over the contacts of their spheres, [L], in E R^2.
     """
 
     start: np.ndarray
@@ -77,7 +77,7 @@ def links(frames: Frames) -> Links:
 
 
 def _of_grains(frames: Frames, start: np.ndarray, pairs: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Sums [F, N] of values [M] over the pairs of grains [M, 2] that a grain is one of, frames beginning at `start`."""
+    """Sums [F, N] for each grain of the values [M] of its pairs [M, 2]; the rows of frame f begin at start[f]."""
     grains = frames.position.shape[1]
     frame = np.repeat(np.arange(frames.count), np.diff(start))
     sums = sum(np.bincount(frame * grains + side, values, frames.count * grains) for side in pairs.T)
@@ -85,11 +85,11 @@ def _of_grains(frames: Frames, start: np.ndarray, pairs: np.ndarray, values: np.
 
 
 def quantities(frames: Frames, network: Links, newton: float) -> list[Colouring]:
-    """What grains can be coloured by; nothing that is zero everywhere, as friction in a pack at rest.
+    """The quantities by which grains can be coloured, without those that are zero everywhere.
 
     Args:
-        frames: the configurations; displacements are those since the first.
-        network: their forces.
+        frames: the configurations; displacements are relative to the first.
+        network: the forces between grains.
         newton: one E R^2, in N.
     """
     lower, lengths = frames.lower[:, None], (frames.upper - frames.lower)[:, None]
@@ -111,14 +111,14 @@ def quantities(frames: Frames, network: Links, newton: float) -> list[Colouring]
 
 
 def packed(frames: Frames, captions: list[str], material: Material = Material()) -> str:
-    """All that a 3D view draws as one text: base64 of deflated bytes, a line of JSON and the arrays that it lists.
+    """All data of a 3D view as one text: a line of JSON and the arrays that it lists, deflated and in base64.
 
     Numbers are kept in 16 bits, between their smallest and their largest.
 
     Args:
         frames: the configurations.
-        captions: what is said of each, [F].
-        material: of the grains, for forces in mN.
+        captions: a caption of each configuration, [F].
+        material: material of the grains, for forces in mN.
     """
     newton = float(material.modulus) * float(material.radius) ** 2
     network = links(frames)
@@ -160,11 +160,11 @@ def _told(quantity: Colouring) -> dict[str, Any]:
 
 
 def _short(array: np.ndarray) -> tuple[Mapping[str, Any], np.ndarray]:
-    """An array as whole numbers, and how to read them: real ones in 16 bits from their smallest in equal steps."""
+    """How to read an array, and the array as whole numbers; real numbers become 16-bit steps from the smallest."""
     if array.dtype.kind == "u":
         return {"kind": f"u{array.dtype.itemsize}", "length": array.size}, array
     low, high = float(array.min(initial=np.inf)), float(array.max(initial=-np.inf))
-    if not high > low:  # nothing, or all the same
+    if not high > low:  # no numbers, or all the same
         low, high = (low, low + 1.0) if array.size else (0.0, 1.0)
     step = (high - low) / _LEVELS
     levels = np.rint((array - low) / step).astype(np.uint16)

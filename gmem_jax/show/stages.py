@@ -14,19 +14,19 @@ from gmem_jax.simulation.stage import BINS
 
 AGAINST = ("time", "u")
 ZERO = "zero signal"
-LINES = 7  # replicas of a page: the zero signal and six others
+LINES = 7  # most replicas in a figure of a page: the zero signal and six others
 NO_CHOICE: Mapping[str, int] = {}
 _STYLES = ("-", "--", ":", "-.")
 
 
 class Quantity(NamedTuple):
-    """What can be drawn of a `Sample`.
+    """A quantity of a `Sample` that can be drawn.
 
     Attributes:
-        label: of the axis, with its unit.
-        curves: values [bins, B] by name.
+        label: label of the axis, with the unit.
+        curves: gives the curves of a sample, values [bins, B] by name.
         log: whether the axis is logarithmic.
-        pascals: of stresses, which are recorded in E: the unit that the label has, in Pa. 0 for all else.
+        pascals: for stresses, which are recorded in E, the unit of the label in Pa; 0 for other quantities.
     """
 
     label: str
@@ -41,7 +41,7 @@ class Quantity(NamedTuple):
 
 
 def _of(field: str, of: Measured) -> dict[str, Quantity]:
-    """What can be drawn of a field: of vectors all components, and each."""
+    """The quantities of a field; for a vector all components together, and each by itself."""
     unit = {"1": "", "E": "kPa"}.get(of.unit, f"${of.unit.replace(' ', chr(92) + ',')}$")
     in_unit, pascals = f" ({unit})" if unit else "", 1e3 if unit == "kPa" else 0.0
 
@@ -68,7 +68,7 @@ def _shear_stress(sample: Sample) -> dict[str, np.ndarray]:
 
 
 QUANTITIES: dict[str, Quantity] = {}
-"""What can be drawn, by name: the fields of a `Sample`, and what follows from them."""
+"""Quantities that can be drawn, by name: the fields of a `Sample`, and others that follow from them."""
 for _field, _measured in MEASURED.items():
     QUANTITIES |= _of(_field, _measured) if _measured.plot else {}
 QUANTITIES |= {
@@ -82,11 +82,11 @@ OBSERVED_PLOT = "observed:"  # before the name of an observer
 
 
 def observed_quantities(stages: Mapping[str, Sample], told: Mapping[str, Any]) -> dict[str, Quantity]:
-    """What can be drawn of what observers gave, as "observed:NAME": a curve, or one for each component.
+    """The quantities of observers, by "observed:NAME": one curve, or one for each component.
 
     Args:
         stages: samples by name.
-        told: units and words by name, where an observer has them.
+        told: units and descriptions of observers by name, if known.
     """
     names = next(iter(stages.values())).observed or {}
     return {OBSERVED_PLOT + name: _observed(name, told.get(name, {})) for name in names}
@@ -116,18 +116,18 @@ def stages_figure(
     chosen: Mapping[str, int] = NO_CHOICE,
     material: Material = Material(),
 ) -> Figure:
-    """A quantity of every stage: a line for the first replica, the zero signal; a band from the lowest to the highest.
+    """A quantity in all stages: a line for the zero signal, and a band from the lowest to the highest replica.
 
-    Of chosen signals a line each, and no band.
+    If signals are chosen, there is a line for each of them, and no band.
 
     Args:
         stages: samples by name, in order.
         quantity: one of `QUANTITIES`, or of `observed_quantities`.
-        title: over the picture.
-        against: "time", or "u" for the stages in which it changes.
-        t0: duration of a compression in t_c, which time is given in; in t0 without it.
-        chosen: numbers of the signals to draw, 0 for the zero signal, by what they are called.
-        material: by which stresses are in pascals.
+        title: title above the picture.
+        against: horizontal axis: "time"; or "u", for the stages in which u changes.
+        t0: duration of a compression, in t_c; without it the time axis is in t0.
+        chosen: numbers of the signals to draw, by name; 0 is the zero signal.
+        material: the material, for stresses in Pa.
     """
     marks = []
     time, spans = _times(stages, t0)
@@ -152,7 +152,7 @@ def stages_figure(
 
 
 def _of_signals(curves: Mapping[str, np.ndarray], chosen: Mapping[str, int]) -> dict[str, np.ndarray]:
-    """The curves of some signals, [bins, 1] each; before they part, all are the zero signal's."""
+    """The curves of the chosen signals, [bins, 1] each; in stages before the first waveform all are the same."""
     if not chosen:
         return dict(curves)
     return {
@@ -163,7 +163,7 @@ def _of_signals(curves: Mapping[str, np.ndarray], chosen: Mapping[str, int]) -> 
 
 
 def _times(stages: Mapping[str, Sample], t0: Any) -> tuple[dict[str, np.ndarray], tuple[tuple[float, float, str], ...]]:
-    """The ends of the bins of each stage, and where each begins and ends."""
+    """The times of the ends of bins by stage; and begin, end and name of each stage."""
     tick, passed, times, spans = (t0 if is_number(t0) else 1.0) / BINS, 0, {}, []
     for name, sample in stages.items():
         bins = len(sample.filling)
@@ -180,16 +180,16 @@ def _time_label(t0: Any) -> str:
 def series_figures(
     stages: Mapping[str, Sample], names: Sequence[str], t0: Any, material: Material = Material()
 ) -> dict[str, Figure]:
-    """Pressures, coordination and filling along a run as one line, of the zero signal and the first six others.
+    """Pressures, coordination and filling along a whole run, with a line for the zero signal and the first six others.
 
     Args:
         stages: samples by name, in order.
-        names: of the signals; none for a preparation.
-        t0: duration of a compression in t_c; what is no number where it differs between replicas.
-        material: by which stresses are in pascals.
+        names: names of the signals; none for a preparation.
+        t0: duration of a compression, in t_c; not a number if it differs between replicas.
+        material: the material, for stresses in Pa.
 
     Returns:
-        The figure against time and that against u, by what a button says.
+        The figure against time and the figure against u, by the text of their buttons.
     """
     time, spans = _times(stages, t0)
     u = [np.asarray(sample.u)[:, 0] for sample in stages.values()]

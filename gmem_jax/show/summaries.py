@@ -43,8 +43,8 @@ from gmem_jax.simulation.sample import Sample
 from gmem_jax.sweeps import table
 from gmem_jax.sweeps.store import Store
 
-KERNEL_NOISE = 1.0  # Pa RMS, that values of a kernel are compared with; as `gmem kernel` does
-LARGEST_CONFUSION = 256  # words
+KERNEL_NOISE = 1.0  # Pa RMS, noise with which singular values of a kernel are compared; the default of `gmem kernel`
+LARGEST_CONFUSION = 256  # words, in the largest confusion matrix of a page
 _ASYMMETRY = "of the recalls of a waveform and its negative: 0 for a linear memory"
 _RESOLUTION = "width in v of a point of the waveform that is read back"
 Draw = Callable[[], Figure]
@@ -54,9 +54,9 @@ class GrainView(NamedTuple):
     """A 3D view of a page.
 
     Attributes:
-        frames: what is seen.
-        material: of the grains, for forces in mN.
-        pack: fingerprint of the pack whose state at rest it is, which a page shows once; "" for frames of a run.
+        frames: gives the frames.
+        material: material of the grains, for forces in mN.
+        pack: fingerprint of the pack, if it is shown at rest, which a page does once; "" for frames of a run.
     """
 
     frames: Callable[[], Frames]
@@ -65,12 +65,12 @@ class GrainView(NamedTuple):
 
 
 class Part(NamedTuple):
-    """What a page shows.
+    """A part of a page.
 
     Attributes:
-        content: a text, a table, a figure, several that are alike but for their x, or grains.
-        heading: over it.
-        folded: whether it is opened by a click on the heading.
+        content: a text, a table, a figure, several figures that differ only in x, or a 3D view.
+        heading: heading above it.
+        folded: whether it is folded, and opens by a click on the heading.
     """
 
     content: str | Table | Figure | Mapping[str, Figure] | GrainView
@@ -80,16 +80,16 @@ class Part(NamedTuple):
 
 @dataclass(frozen=True)
 class Summary:
-    """What a file holds.
+    """The content of a file, for a person and for programs.
 
     Attributes:
-        title: what it is.
-        facts: as one JSON object.
+        title: kind and name of the file.
+        facts: the content as one JSON object.
         lines: tables and lines for a person.
-        figures: what makes them, by name; the first says most.
-        parts: what else a page shows, in order.
+        figures: functions that make the figures, by name; the first figure says most.
+        parts: gives further parts of a page, in order.
         configuration: every parameter, for a page.
-        csv: makes the recalled signals, or a row for each (`each=True`), for a recall.
+        csv: for a recall, gives the recalled signals as CSV, or a row for each signal (`each=True`).
     """
 
     title: str
@@ -104,19 +104,19 @@ class Summary:
 def summary_of(
     source: str | Path, against: str = "time", signals: Sequence[int] = (), *, each: bool = False, **chosen: Any
 ) -> Summary:
-    """What a file, a pack or the folder of a sweep holds.
+    """The content of a file, of a pack, or of the folder of a sweep.
 
     Args:
-        source: its path, or the name of a pack.
-        against: "time" or "u": what pictures of stages are drawn over.
-        signals: numbers of those that pictures of a recall show; default all.
-        each: whether a recall tells of each signal by itself, however many there are.
+        source: a path, or the name of a pack.
+        against: horizontal axis of pictures of stages, "time" or "u".
+        signals: numbers of the signals in pictures of a recall; default all.
+        each: whether the lines of a recall have every signal, however many there are.
         **chosen: x, by and over of the picture of a sweep (`gmem_jax.sweeps.curves.axes_of`).
 
     Raises:
-        ValueError: if signals are chosen of what is no recall.
-        FileNotFoundError: if it is not there.
-        FileFormatError: if it is of no kind that commands write, or damaged.
+        ValueError: if signals are chosen and the file is not a recall.
+        FileNotFoundError: if there is no such file.
+        FileFormatError: if it is damaged, or of a kind that no command writes.
     """
     found = _summary_of(Path(source), against, signals, each, chosen)
     if signals and found.csv is None:
@@ -152,7 +152,7 @@ def _summary_of(file: Path, against: str, signals: Sequence[int], each: bool, ch
 def of_recall(
     recall: Recall, name: str = "", *, against: str = "time", signals: Sequence[int] = (), each: bool = False
 ) -> Summary:
-    """What is said of a recall; see `summary_of`."""
+    """The summary of a recall; see `summary_of`."""
     configuration, row = recall.configuration, summary(recall)
     choice: dict[str, Any] = {"against": against, "signals": signals}
     pictures = (*PICTURES, *observed_quantities(recall.stages, configuration.get("observed", {})))
@@ -200,7 +200,7 @@ def _series(
 
 
 def _grains(recall: Recall, names: Sequence[str], material: Material) -> Iterator[Part]:
-    """The frames of a recall, or its pack at rest if it is there."""
+    """The frames of a recall; or its pack at rest, if its file is there."""
     if (frames := recall.frames) is not None:
         whose = f"the run of {names[frames.signal - 1]}" if frames.signal else "the run without shear"
         yield Part(f"{frames.count} moments of {whose}; displacements are since the first.", "Grains")
@@ -221,7 +221,7 @@ def _grains(recall: Recall, names: Sequence[str], material: Material) -> Iterato
 def of_pack(
     pack: Pack, stages: Mapping[str, Sample] | None = None, frames: Frames | None = None, against: str = "time"
 ) -> Summary:
-    """What is said of a pack, the stages of its preparation and frames of it, where they were kept."""
+    """The summary of a pack, with the stages and frames of its preparation, if they were kept."""
     kept, t0 = dict(stages or {}), pack.info.get("recipe", {}).get("t0")
     material = recorded_material(pack.info)
     drawn: dict[str, Draw] = {"grains": partial(figures.grains_figure, pack)}
@@ -248,7 +248,7 @@ def _stored_pack(file: Path, against: str) -> Summary:
 def of_kernel(
     kernel: MemoryKernel, configuration: Mapping[str, Any], noise: float = KERNEL_NOISE, name: str = ""
 ) -> Summary:
-    """What is said of a memory kernel; `noise` in Pa RMS."""
+    """The summary of a memory kernel; `noise` is in Pa RMS."""
     modulus, count = float(recorded_material(configuration).modulus), len(kernel.centres)
     pack = cell(configuration.get("pack", name))
     capacity = kernel.capacity(noise / modulus)
@@ -286,7 +286,7 @@ def of_kernel(
 
 
 def of_reading(facts: dict[str, Any], name: str = "") -> Summary:
-    """What is said of a classification, from its result."""
+    """The summary of a classification, from its result."""
     words, readers = facts["words"], facts["readers"]
     title, net = f"{cell(facts['pack'])}, {plural(facts['bits'], 'bit')}", readers["net"]
     nets = len(np.asarray(net["read"]).reshape(-1, words))
@@ -306,7 +306,7 @@ def of_reading(facts: dict[str, Any], name: str = "") -> Summary:
 
 
 def of_gradient(facts: dict[str, Any], name: str = "") -> Summary:
-    """What is said of the derivatives of a fidelity, from their result."""
+    """The summary of the derivatives of a fidelity, from their result."""
     slopes, configuration = facts["gradient"], facts.get("configuration", {})
     title = f"{cell(facts['pack'])}: F = {facts['fidelity']:.4f}"
     law = configuration.get("friction")
@@ -326,7 +326,7 @@ def of_gradient(facts: dict[str, Any], name: str = "") -> Summary:
 
 
 def of_tuned(facts: dict[str, Any], name: str = "") -> Summary:
-    """What is said of a tuned drive, from its result."""
+    """The summary of a tuned drive, from its result."""
     packs, history = ", ".join(map(cell, facts["packs"])), facts["history"]
     values = ", ".join(f"{key} = {value:.4g}" for key, value in facts["values"].items())
     line = f"{packs}: mean F {facts['before']:.4f} -> {facts['fidelity']:.4f} with {values}"
@@ -384,7 +384,7 @@ def _all(drawn: Mapping[str, Draw]) -> Iterator[Part]:
 
 
 def of_sweep(store: Store, **chosen: Any) -> Summary:
-    """What is said of a sweep; `chosen` are x, by and over of `gmem_jax.sweeps.curves.axes_of`.
+    """The summary of a sweep; `chosen` are x, by and over of `gmem_jax.sweeps.curves.axes_of`.
 
     Raises:
         FileFormatError: if there is no sweep, or a result is damaged.
@@ -425,4 +425,4 @@ PLOTS = {
     "windowed_fidelity": "F after a running mean over the ringing period",
     **{name: f"{_plain(quantity.label)}, over the stages" for name, quantity in QUANTITIES.items()},
 }
-"""What every picture shows, in words."""
+"""Descriptions of all pictures, by name."""

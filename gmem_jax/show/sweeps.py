@@ -17,7 +17,7 @@ from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.table import names_in, points_in
 
 ABOUT = "F(T1): F after a running mean over the ringing period"
-FEW_LINES = 6  # whose names fit inside the axes
+FEW_LINES = 6  # most lines whose legend fits inside the axes
 _LABELS = {
     "gain": "gain G",
     "fidelity": "fidelity F",
@@ -27,7 +27,7 @@ _LABELS = {
 
 
 def sweep_facts(store: Store, table: list[dict[str, Any]]) -> dict[str, Any]:
-    """What is said of a sweep, and its points."""
+    """Numbers of points by state, status and seconds of a sweep, and the rows of its table."""
     points = points_in(table)
     states = {state: sum(row["state"] == state for row in points) for state in ("done", "failed", "open")}
     done = [row for row in points if row["state"] == "done"]
@@ -37,7 +37,7 @@ def sweep_facts(store: Store, table: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def points_table(table: list[dict[str, Any]], names: list[str]) -> Table:
-    """The points of a sweep: what varies, G, F and the status, from `gmem_jax.sweeps.table.rows`."""
+    """A table of the points of a sweep: the names that vary, G, F and status, from `gmem_jax.sweeps.table.rows`."""
     drawn, names = Table(caption_justify="left"), names_in(table, names)
     for name in (*names, "G", "F", "F(T1)", "status"):
         drawn.add_column(name, no_wrap=name != "status")
@@ -51,19 +51,19 @@ def points_table(table: list[dict[str, Any]], names: list[str]) -> Table:
 
 
 def _state(row: dict[str, Any]) -> str:
-    """The status of a point, or of several, in words."""
+    """The status of a point, or of several, as a short text."""
     return ", ".join([*status_words(row["status"] or 0), *(["warned"] if row["warnings"] else [])]) or "ok"
 
 
 def _reasons(table: list[dict[str, Any]]) -> list[str]:
-    """What the words of `_state` mean in a table."""
+    """Explanations of the words of `_state` that occur in a table."""
     bits = {bit for row in table for bit in Status if (row["status"] or 0) & bit}
     told = dict.fromkeys(f"warned: {row['warnings']}" for row in table if row["warnings"])
     return [*(f"{word}: {SENTENCES[bit]}" for bit in sorted(bits) for word in status_words(bit)), *told]
 
 
 def means_table(table: list[dict[str, Any]], names: list[str]) -> Table:
-    """Means over points, from `gmem_jax.sweeps.table.means`."""
+    """A table of means over points, from `gmem_jax.sweeps.table.means`."""
     drawn = Table(caption_justify="left")
     for name in (*names, "n", "G", "F", "F(T1)", "status"):
         drawn.add_column(
@@ -87,17 +87,17 @@ def _with_error(row: dict[str, Any], measure: str) -> str:
 def sweep_figure(
     rows: Sequence[Mapping[str, Any]], names: Sequence[str], measure: str, title: str, **chosen: Any
 ) -> Figure:
-    """A measure of the points of a sweep; several at one place as dots, their mean and its standard error.
+    """A measure of the points of a sweep. Several points at one place are dots, with their mean and standard error.
 
     Args:
-        rows: of the points (`gmem_jax.sweeps.table.rows`).
-        names: that vary.
+        rows: rows of the points (`gmem_jax.sweeps.table.rows`).
+        names: the names that vary.
         measure: one of `MEASURES`.
-        title: of the picture.
+        title: title above the picture.
         **chosen: `x`, `by` and `over` of `axes_of`.
 
     Raises:
-        ValueError: if no point is done, or the choice cannot be (see `axes_of`).
+        ValueError: if no point is done, or the choice is impossible (see `axes_of`).
     """
     done = [row for row in rows if row["state"] == "done"]
     if not done:
@@ -129,7 +129,7 @@ def _label(line: Line) -> str:
 
 
 def against(x: str, rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Figure | None:
-    """F and G of a sweep against a number that varies and is no sample; None if it is none."""
+    """F and G of a sweep against x; None if x is a sample, or has fewer than two numbers among the points done."""
     done = [row for row in rows if row["state"] == "done" and isinstance(row[x], int | float)]
     if is_sample(x) or len({row[x] for row in done}) < 2:
         return None

@@ -25,19 +25,19 @@ from gmem_jax.preparation.recipe import pressure_over_wanted
 from gmem_jax.show.numbers import published
 from gmem_jax.simulation.stage import BINS
 
-FEW = 8  # signals that are told of one by one unasked
-NONE = "-"  # in the place of a measure of what was not written
-SLOW_ENOUGH = 1.8e3  # t0, in t_c: G and F agree with those at ten times slower drives where nothing rings
+FEW = 8  # most signals, and stages, that are listed unasked
+NONE = "-"  # stands for a measure that is NaN
+SLOW_ENOUGH = 1.8e3  # t0, in t_c: there G and F agree with those of ten times slower drives if nothing rings
 
 
 class Fact(NamedTuple):
     """A number for a person.
 
     Attributes:
-        name: what it is called.
+        name: name of the number.
         value: a number, or a text.
-        unit: of the value.
-        words: what it means.
+        unit: unit of the value.
+        words: meaning of the number.
     """
 
     name: str
@@ -64,7 +64,7 @@ def history_table(names: Iterable[str], history: Sequence[Mapping[str, float]]) 
 
 
 def errors_table(recall: Recall) -> Table:
-    """G and F with their standard errors over signals, as they are and averaged over the ringing period."""
+    """G and F with their standard errors over signals, without and with a running mean over the ringing period."""
     configuration, window = recall.configuration, float(recall.window)
     scale = np.asarray(relative_scale(configuration))
     told = "G: gain; F: fidelity, 1 if what is recalled is the integral of what was stored; errors: standard errors "
@@ -90,19 +90,19 @@ def errors_table(recall: Recall) -> Table:
 
 
 def _where(parts: Sequence[Recall]) -> list[str]:
-    """What tells recalls of one read and channel each apart: "read", "channel", both or neither."""
+    """Which of "read" and "channel" differ between recalls of one read and channel each."""
     return [name for name in ("read", "channel") if len({getattr(one, f"{name}s") for one in parts}) > 1]
 
 
 def decimal(value: float, error: float = math.nan, digits: int = 3) -> str:
-    """A measure, and its standard error where there is one; NaN, where nothing can be said, as "-"."""
+    """A measure with its standard error, if there is one, as a text; "-" for NaN."""
     if math.isnan(value):
         return NONE
     return f"{value:.{digits}f}" + (f" ± {error:.{digits}f}" if math.isfinite(error) else "")
 
 
 def target_line(row: dict[str, Any]) -> str:
-    """The same in words, from such a `summary`."""
+    """Gain and fidelity with respect to the target of a design, as a text, from the `summary` of a recall."""
     return (
         f"designed waveforms: G = {row['target_gain']:.3f}, F = {row['target_fidelity']:.4f} with respect to the\n"
         "target of their design; the table compares with the J of the waveforms themselves"
@@ -110,7 +110,7 @@ def target_line(row: dict[str, Any]) -> str:
 
 
 def recall_lines(row: dict[str, Any], configuration: dict[str, Any], *, each: bool = False) -> list[Any]:
-    """What to print of one recall, from its `summary`: each of more than a few signals only if that is asked for."""
+    """Tables and lines for one recall, from its `summary`; more than `FEW` signals are listed only if `each` is set."""
     more: list[Any] = [signals_table(row)] if each or 1 < signals_told(row) <= FEW else []
     if len(row.get("channels", ())) > 1:
         more = [gains_table(row), *more]
@@ -131,12 +131,12 @@ def parts_of(row: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _named(row: dict[str, Any]) -> list[str]:
-    """Which of read and channel there are several of, so that their names are told, in such a `summary`."""
+    """Which of "read" and "channel" a recall has several of, from its `summary`; tables then name them."""
     return [name for name in ("read", "channel") if len(row.get(f"{name}s", ())) > 1]
 
 
 def signals_told(row: dict[str, Any]) -> int:
-    """How many rows `signals_table` has."""
+    """Number of rows of `signals_table`."""
     return sum(len(one["signals"]) for one in parts_of(row))
 
 
@@ -164,7 +164,7 @@ def gains_table(row: dict[str, Any]) -> Table:
 
 
 def backgrounds_table(row: dict[str, Any]) -> Table:
-    """Gain and fidelity by each background, from the `summary` of a recall with a second readout."""
+    """Gain and fidelity with each background, from the `summary` of a recall with a second readout."""
     table = Table(title="By background")
     for column in ("background", "G", "F", "G over T1", "F over T1"):
         table.add_column(column, justify="left" if column == "background" else "right")
@@ -174,7 +174,7 @@ def backgrounds_table(row: dict[str, Any]) -> Table:
 
 
 def second_readout_lines(row: dict[str, Any]) -> str:
-    """What the second readout still holds, in words, from such a `summary`."""
+    """The memory that the second readout still finds, as a text, from the `summary` of a recall."""
     left = row["second_readout"]
     error = " ± SE" if math.isfinite(left["gain_se"]) else ""
     return (
@@ -184,11 +184,11 @@ def second_readout_lines(row: dict[str, Any]) -> str:
 
 
 def recall_table(rows: list[dict[str, Any]], configuration: dict[str, Any]) -> Table:
-    """Gain and fidelity of recalls, raw and averaged over the ringing period, beside the published point.
+    """Gain and fidelity of recalls, without and with a mean over the ringing period, beside the published point.
 
     Args:
-        rows: a `summary` for each pack; several get a line of mean and standard deviation.
-        configuration: resolved, of any of them.
+        rows: a `summary` for each pack; several packs get a line of mean and standard deviation.
+        configuration: configuration of any of the recalls.
     """
     table, named = Table(title="Recall of the waveforms", caption=conditions(configuration)), _named(rows[0])
     texts = ("pack", *named, "status")  # may wrap in a narrow terminal; numbers are never cut
@@ -201,7 +201,7 @@ def recall_table(rows: list[dict[str, Any]], configuration: dict[str, Any]) -> T
             places = (one[name] for name in named)
             numbers = [decimal(one[key]) for key in analysis.MEASURES]
             table.add_row(ends[0], *places, *numbers, *ends[1:])
-            ends = ("",) * 3  # they are of all reads and channels
+            ends = ("",) * 3  # given once for all reads and channels
     if len(rows) > 1:
         table.add_section()
         for several in zip(*map(parts_of, rows), strict=True):
@@ -217,20 +217,21 @@ def recall_table(rows: list[dict[str, Any]], configuration: dict[str, Any]) -> T
 
 
 def heading(configuration: dict[str, Any]) -> str:
-    """What stands over a picture of a recall: its pack, and its conditions."""
+    """The title of a picture of a recall: its pack and its conditions."""
     return f"{cell(configuration['pack'])}: {conditions(configuration)}"
 
 
 def cell(value: Any) -> str:
-    """A value as a table shows it; of a file, its name."""
+    """A value as a short text for a table; an HDF5 file by its name without folder and suffix."""
     text = f"{value:.4g}" if isinstance(value, float) else "" if value is None else str(value)
     return Path(text).stem if text.endswith(".h5") else text
 
 
 def conditions(configuration: dict[str, Any]) -> str:
-    """What a recall depends on first of all: law, mu, gamma0, delta0, t0, signals; its background if not SUB0.
+    """The main conditions of a recall: law, mu, gamma0, delta0, t0 and signals; the background if it is not SUB0.
 
-    Of another protocol than the paper's its stages, too; and what the paper has not, if it was given.
+    Effects that the paper does not have, such as creep, are named if they were given; and so are the stages of a
+    protocol that is not the paper's.
     """
     known = values_of(configuration)
     first = ", ".join(f"{name} = {_amount(known[name])}" for name in ("mu", "gamma0", "delta0", "t0"))
@@ -251,7 +252,7 @@ def conditions(configuration: dict[str, Any]) -> str:
 
 
 def _stages(protocol: Any) -> str:
-    """The stages of a written protocol that is not the paper's, in words."""
+    """The stages of a protocol in written form as a text; "" for the paper's protocol."""
     given = protocol if isinstance(protocol, list) else ()
     names = [str(stage.get("name")) for stage in given if isinstance(stage, Mapping)]
     more = f", ... ({len(names)} in all)" if len(names) > FEW else ""
@@ -264,10 +265,10 @@ def _amount(value: Any) -> str:
 
 
 def _comparable(configuration: dict[str, Any]) -> list[dict[str, Any]]:
-    """Published points of the same experiment: signals, background, law, grain, size, drive, stages, and a rate not
-    faster than that at which fast drives were found to agree with the paper's.
+    """Published points of the same experiment: signals, background, law, grain, size, drive and stages.
 
-    What the paper leaves open may be chosen otherwise: to see what it does to the agreement is why one would.
+    There are none if t0 is below `SLOW_ENOUGH`. Parameters that the paper leaves open may have other values: one would
+    change them to see the effect on the agreement.
     """
     written, known = configuration.get("experiment", {}), values_of(configuration)
     if written.get("signals") != {"kind": "six"} or known.get("background") != "sub0":
@@ -287,7 +288,7 @@ def _comparable(configuration: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def reading_tables(result: dict[str, Any]) -> list[Table]:
-    """The readers beside each other and the published accuracy, and the bits' error rates, from a `reading_report`."""
+    """Two tables from a `reading_report`: readers beside the published accuracy, and the error rate of each bit."""
     bits = result["bits"]
     title = f"Reading {result['words']} words of {plural(bits, 'bit')} ({result['background'].upper()})"
     readers_table = Table(
@@ -314,13 +315,13 @@ def reading_tables(result: dict[str, Any]) -> list[Table]:
 
 
 def _tetra(shape: str) -> tuple[str, float]:
-    """Kind and overlap of a shape like "tetra(0.6)"; an overlap that matches nothing for other shapes."""
+    """Kind and overlap of a shape like "tetra(0.6)"; for other shapes the overlap is NaN, which matches nothing."""
     kind, _, rest = shape.partition("(")
     return kind, float(rest.rstrip(")")) if kind == "tetra" else math.nan
 
 
 def pack_table(pack: Pack) -> Table:
-    """What a pack file holds."""
+    """A table of the numbers of a pack."""
     unit = recorded_material(pack.info).modulus
     rest = pack.info.get("at_rest", {})
     recipe = pack.info.get("recipe", {})

@@ -19,7 +19,7 @@ HEIGHT = 730  # pixels of a view in a notebook
 
 
 def web(name: str) -> str:
-    """A file that goes into pages."""
+    """The text of one of the files that go into pages."""
     return (resources.files("gmem_jax") / "show" / "web" / name).read_text(encoding="utf-8")
 
 
@@ -27,10 +27,10 @@ def page(title: str, body: str, *, three: bool, bare: bool = False) -> str:
     """A whole page.
 
     Args:
-        title: plain text.
-        body: HTML.
-        three: whether there are 3D views in it.
-        bare: whether nothing stands beside a view.
+        title: title, as plain text.
+        body: content, as HTML.
+        three: whether it has 3D views.
+        bare: whether the page has nothing but a view.
     """
     head = ""
     if three:
@@ -45,7 +45,7 @@ def page(title: str, body: str, *, three: bool, bare: bool = False) -> str:
 
 
 def _address(script: str) -> str:
-    """A script as an address that can be imported."""
+    """A script as a data address, from which a page can import it."""
     return f"data:text/javascript;base64,{base64.b64encode(script.encode()).decode()}"
 
 
@@ -53,9 +53,9 @@ def figure(name: str, frames: Frames, material: Material = Material()) -> str:
     """The HTML of one 3D view, for a `page` with three.
 
     Args:
-        name: of the view in the page: letters, digits and dashes.
-        frames: what to show.
-        material: of the grains, for forces in mN.
+        name: identifier of the view in the page: letters, digits and dashes.
+        frames: the frames.
+        material: material of the grains, for forces in mN.
     """
     captions = [
         f"{stage}, u = {u:.3f}, t = {time:,.0f} t_c"
