@@ -14,13 +14,13 @@ _NOTHING: Values = {}
 
 
 class Choice(NamedTuple):
-    """Something that has to be chosen.
+    """A choice that the paper leaves open.
 
     Attributes:
-        name: of a sweep file.
-        words: what it is.
-        values: that are tried, the default first.
-        shared: what all its points have besides.
+        name: its name in a sweep file.
+        words: a description.
+        values: the values that are tried, the default first.
+        shared: further values that all its points have.
     """
 
     name: str
@@ -41,20 +41,20 @@ CHOICES = (
     Choice("word_pad", "free bits at the ends of words", (2.0, 1.0, 3.0), _WORDS),
     Choice("word_width", "width of the bumps of words (bits)", (1.0, 0.5, 1.5), _WORDS),
 )
-# Smaller packs than the figures': there are many points.
+# The packs are smaller than those of the figures, since there are many points.
 SIZES: dict[str, Scale] = SCALES | {"workstation": replace(SCALES["workstation"], t0=3.6e3, grains=1024)}
 
 
 class Effect(NamedTuple):
-    """What a value of a choice does.
+    """The effect of one value of a choice.
 
     Attributes:
         choice: the choice.
-        value: that was tried.
-        gain: G over packs.
-        fidelity: F over packs.
-        of_gain: G less that of the default on the same pack, in parts of it, over packs; NaN for the default.
-        of_fidelity: F less that of the default on the same pack, over packs; NaN for the default.
+        value: the value.
+        gain: mean of G over packs.
+        fidelity: mean of F over packs.
+        of_gain: mean over packs of the relative change of G against the default on the same pack; 0 for the default.
+        of_fidelity: mean over packs of the change of F against the default on the same pack; 0 for the default.
         status: all status bits of the recalls.
     """
 
@@ -68,17 +68,17 @@ class Effect(NamedTuple):
 
     @property
     def default(self) -> bool:
-        """Whether this is what is chosen unless something else is asked for."""
+        """Whether the value is the default."""
         return bool(self.value == self.choice.values[0])
 
 
 def _values(choice: Choice, value: Any) -> Values:
-    """A point's values, packs aside. The default is left out, so that all choices share that point."""
+    """The values of a point, without its pack. The default value is left out, so that all choices share that point."""
     return choice.shared if value == choice.values[0] else {**choice.shared, choice.name: value}
 
 
 def choice_points(packs: Sequence[Values]) -> list[Values]:
-    """The runs that the table needs, on some packs; none twice."""
+    """The points that the table needs, on some packs; each occurs once."""
     tried = [_values(choice, value) for choice in CHOICES for value in choice.values]
     return crossed(packs, [values for place, values in enumerate(tried) if values not in tried[:place]])
 
@@ -87,10 +87,11 @@ def effects(packs: Sequence[Values], runs: Iterable[tuple[Values, dict[str, Any]
     """Every value of every choice beside its default, pack by pack.
 
     Args:
-        packs: what names them.
+        packs: values that name the packs.
         runs: values of points and summaries of their recalls (`show.numbers.summary`); points that failed are missing.
-            A value that comes to the same run as the default, as steps longer than a bin do, is left out.
-        t0: at which they were run: below the paper's, G and F are those after averaging over the ringing period.
+            A value that makes the same run as the default, as steps longer than a bin do, is left out.
+        t0: duration of a compression in these runs, in t_c; below the paper's, G and F are those after a running mean
+            over the ringing period.
     """
     known = list(runs)
 
@@ -108,7 +109,7 @@ def effects(packs: Sequence[Values], runs: Iterable[tuple[Values, dict[str, Any]
 
 
 def _differ(default: Mapping[str, Any], tried: Mapping[str, Any]) -> bool:
-    """Whether two runs are not the same one, which gives the same measures to the last bit."""
+    """Whether two runs differ: the same run gives the same measures to the last bit."""
     return any(default[name] != tried[name] for name in ("gain", "fidelity", "windowed_gain", "windowed_fidelity"))
 
 
@@ -132,12 +133,12 @@ def _row(effect: Effect) -> dict[str, Any]:
 
 
 def effect_rows(found: Sequence[Effect]) -> list[dict[str, Any]]:
-    """Every value of every choice as a line of a table."""
+    """Rows of a table with every value of every choice."""
     return [_row(effect) for effect in found]
 
 
 def draw(path: Path, found: Sequence[Effect], title: str) -> None:
-    """The change of G and of F with every value that is not the default, with standard errors over packs.
+    """Draw the changes of G and of F with every value that is not the default, with standard errors over packs.
 
     Raises:
         OSError: if it cannot be written.
@@ -163,7 +164,7 @@ def draw(path: Path, found: Sequence[Effect], title: str) -> None:
 
 
 def choices_title(scale: Scale, packs: int) -> str:
-    """What stands over the picture of some packs."""
+    """The title of the picture, for a number of packs."""
     of = "one pack" if packs == 1 else f"mean ± SE over {packs} packs"
     return f"What the paper leaves open\nN = {scale.grains:,}, $t_0$ = {scale.t0:,.0f} $t_c$, {of}"
 

@@ -25,17 +25,17 @@ STORES = (0.5, 2.0, 8.0)  # t0
 STANDARD_STORE = 2.0
 AMPLITUDES = (3e-4, 1e-3, 3e-3)
 VARIED = ("gamma0", "store", "background", "shear", "hold_drag")
-LITTLE = 0.1  # of what is recalled: below it, a claim that nothing is left holds
+LITTLE = 0.1  # part of the recall below which a claim that nothing is left holds
 
 
 class Verdict(NamedTuple):
-    """What became of a claim.
+    """The test of a claim.
 
     Attributes:
-        claim: in the words of the paper's subject.
-        holds: whether it does here.
-        numbers: what was measured, in a line.
-        values: the same as numbers.
+        claim: the claim, as a sentence.
+        holds: whether it holds here.
+        numbers: the measured numbers, in a line.
+        values: the measured numbers by name.
     """
 
     claim: str
@@ -45,7 +45,7 @@ class Verdict(NamedTuple):
 
 
 def stress_is_minus_j(recall: Recall) -> Verdict:
-    """p_xy at u = 1 is -C J(1): of what was applied, the pack keeps the integral of the shear."""
+    """p_xy at u = 1 is -C J(1): the pack keeps the integral of the shear that was applied."""
     p_xy = recalled(jnp.asarray(recall.stages[recall.protocol.reads[0]].pressure))
     kept = np.asarray(p_xy[1:, -1] - p_xy[0, -1])  # u ascends: the readout begins with the last
     whole = np.asarray(recall.J)[:, -1]
@@ -97,11 +97,11 @@ def reading_erases(recall: Recall, scale: float) -> Verdict:
 
 
 def order_matters(standard: Recall, before: Recall, scale: float) -> Verdict:
-    """A shear pulse before the compression leaves nothing to be read: no waveform, that is.
+    """A shear pulse before the compression leaves no waveform to be read.
 
-    What it moved for good leaves an offset, about as large at every u, and the same for one bump early, one late or
-    two (docs/decisions/experiment.md). J has a sign for most of the signals, so that an offset alone has a gain. The
-    verdict is on p_sig and J less their means over u.
+    It leaves an offset, since it moves some grains for good. The offset is about as large at every u, and the same for
+    one bump early, one late or two (docs/decisions/experiment.md). Most J have one sign, so that an offset alone has a
+    gain. The verdict is therefore on p_sig and J less their means over u.
     """
     ratio = float(np.sqrt(np.sum(np.asarray(before.p_sig) ** 2) / np.sum(np.asarray(standard.p_sig) ** 2)))
     waved, wave = (float(compare(_less_mean(one.p_sig), _less_mean(one.J), scale).gain) for one in (before, standard))
@@ -129,7 +129,7 @@ def proportional(recalls: dict[float, Recall]) -> Verdict:
 
 
 def rearrangement(pack: Pack, friction: Any, t0: float) -> float:
-    """How far grains are from where they were after one cycle without shear, in R; root mean square."""
+    """Root mean square displacement of the grains after one cycle without shear, in R."""
     experiment = Experiment(pack, six_signals(), friction, t0=t0)
     on = runner_of(experiment)
     before = on.state
@@ -154,10 +154,10 @@ def rearranges(packs: dict[str, Pack], t0: float) -> Verdict:
 
 
 def forces_tell_nothing(experiment: Experiment) -> Verdict:
-    """The distribution of contact forces at u = 1 does not tell signals from none.
+    """The distribution of contact forces at u = 1 does not show whether a signal was stored.
 
-    Kolmogorov's distance between the distributions with and without a signal, beside that of two halves of one pack's
-    contacts, which is what chance makes.
+    The test is Kolmogorov's distance between the distributions with and without a signal. It is compared with the
+    distance between two random halves of the contacts of one pack, which is due to chance.
     """
     from scipy.stats import ks_2samp
 
@@ -182,7 +182,7 @@ def forces_tell_nothing(experiment: Experiment) -> Verdict:
 
 
 def claim_points(packs: Sequence[Values]) -> list[Values]:
-    """The runs that claims need, on each of some packs."""
+    """The points that the claims need, on each of some packs."""
     amplitudes: list[Values] = [{"gamma0": gamma0} for gamma0 in AMPLITUDES]
     stores: list[Values] = [{"store": store} for store in STORES if store != STANDARD_STORE]
     more: list[Values] = [{"background": "sub2"}, {"shear": "before"}, {"store": max(STORES), "hold_drag": 0.0}]
@@ -195,10 +195,10 @@ def verdicts(
     """Every claim on one pack.
 
     Args:
-        pack: of tetra grains.
+        pack: a pack of tetra grains.
         t0: duration of one compression, in t_c.
-        runs: of `claim_points` on this pack, with their values.
-        others: packs of other grains by their names, for the claim on rearrangement.
+        runs: values and recalls of `claim_points` on this pack.
+        others: packs of other grains by name, for the claim on rearrangement.
     """
 
     def having(**wanted: Any) -> Recall:

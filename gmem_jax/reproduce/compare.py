@@ -21,19 +21,19 @@ PAPER_GRAINS = 10_240
 
 @dataclass(frozen=True)
 class Conditions:
-    """What a point is measured at, packs aside.
+    """The conditions of a point, without its pack.
 
     Attributes:
         law: "H", "M1" or "M2", and its variant if that is not the default.
-        shape: "tetra" or "sphere".
+        shape: "tetra" or "sphere"; with sizes of the grains, if they differ.
         overlap: O of a tetra grain; 1 for spheres.
         grains: N.
-        mu: friction.
+        mu: friction coefficient.
         delta0: compression.
-        gamma0: amplitude.
+        gamma0: shear amplitude.
         bits: length of words; 0 for the six signals.
-        background: of the measure.
-        boundary: of the box; "walls", as in the paper, or see `gm.Recipe`.
+        background: background of the measure.
+        boundary: boundary of the box: "walls", as in the paper, or see `gm.Recipe`.
     """
 
     law: str
@@ -49,7 +49,7 @@ class Conditions:
 
 
 class ComputedPoint(NamedTuple):
-    """One pack at some conditions: `show.numbers.summary` of its recall, and where that lies."""
+    """One pack at some conditions: `show.numbers.summary` of its recall, and the key of the point in the store."""
 
     conditions: Conditions
     numbers: dict[str, Any]
@@ -65,7 +65,7 @@ class Estimate(NamedTuple):
 
     @classmethod
     def of(cls, values: Sequence[float]) -> "Estimate":
-        """That of a value for each pack."""
+        """The estimate from one value for each pack."""
         mean, deviation, _ = spread(values)
         return cls(mean, deviation, len(values))
 
@@ -79,10 +79,11 @@ class Compared(NamedTuple):
     """A measure at some conditions.
 
     Attributes:
-        conditions: ours.
+        conditions: our conditions.
         measure: "F", "G" or "accuracy" and a reader of words.
-        ours: over our packs.
-        theirs: the published one, of the same conditions or, at another N, the closest there is; None if there is none.
+        ours: the estimate over our packs.
+        theirs: the published estimate at the same conditions, or, if there is none of the same N, that at the paper's
+            usual N; None if there is none.
         grains: N of the published point.
         status: all status bits of our recalls.
     """
@@ -96,9 +97,9 @@ class Compared(NamedTuple):
 
     @property
     def errors_apart(self) -> float:
-        """(ours - theirs) over the combined standard error, for the same N; NaN where it cannot be said.
+        """(ours - theirs) over the combined standard error, if N is the same; else NaN.
 
-        One pack of ours counts with the published scatter of packs.
+        If ours is one pack, its error is taken to be the published SD over packs.
         """
         if self.theirs is None or self.grains != self.conditions.grains:
             return math.nan
@@ -108,7 +109,7 @@ class Compared(NamedTuple):
 
 
 def conditions_of(configuration: dict[str, Any]) -> Conditions:
-    """What a recall was measured at, from its configuration."""
+    """The conditions of a recall, from its configuration."""
     law, known = configuration["experiment"]["friction"], values_of(configuration)
     entry = next(entry for entry in LAWS if entry.name == known["friction"])
     variant = law.get("variant", "averaged")
@@ -130,7 +131,7 @@ def conditions_of(configuration: dict[str, Any]) -> Conditions:
 
 
 def points_of(store: Store) -> list[ComputedPoint]:
-    """Every finished point of the sweep that a store was last asked for; once, in however many words it was."""
+    """All finished points of the latest sweep of a store; points with one key count once."""
     found = []
     done = store.done()
     for key in dict.fromkeys(row["key"] for row in store.card()["points"]):
@@ -141,12 +142,12 @@ def points_of(store: Store) -> list[ComputedPoint]:
 
 
 def counted(t0: float) -> tuple[str, str]:
-    """The names of the gain and the fidelity that count at a rate: where it rings, those averaged over the ringing."""
+    """The names of the gain and fidelity that count at t0; below the paper's, those after a mean over the ringing."""
     return ("windowed_gain", "windowed_fidelity") if t0 < PAPER_T0 else ("gain", "fidelity")
 
 
 def _measures(point: ComputedPoint, t0: float) -> dict[Conditions, tuple[float, float]]:
-    """G and F of a point by its conditions: one for every background that it has."""
+    """G and F of a point by conditions, for every background that it has."""
     at = asdict(point.conditions)
     rows = point.numbers.get("backgrounds", {point.conditions.background: point.numbers})
     gain, fidelity = counted(t0)
@@ -154,11 +155,12 @@ def _measures(point: ComputedPoint, t0: float) -> dict[Conditions, tuple[float, 
 
 
 def compare_points(points: Iterable[ComputedPoint], t0: float) -> list[Compared]:
-    """Means over packs beside the published points, in the order in which the conditions come.
+    """Means over packs beside the published points, in the order in which the conditions occur.
 
     Args:
-        points: of any number of packs.
-        t0: at which they were run: below the paper's, F and G are those after averaging over the ringing period.
+        points: points on any number of packs.
+        t0: duration of a compression in these runs, in t_c; below the paper's, F and G are those after a running mean
+            over the ringing period.
     """
     groups: dict[Conditions, list[tuple[float, float, int]]] = {}
     for point in points:
@@ -173,7 +175,7 @@ def compare_points(points: Iterable[ComputedPoint], t0: float) -> list[Compared]
 
 
 def compared(conditions: Conditions, measure: str, values: Sequence[float], status: int) -> Compared:
-    """The mean of a measure over packs, beside what is published of it."""
+    """The mean of a measure over packs, beside the published one."""
     return _beside(conditions, measure, Estimate.of(values), status)
 
 
@@ -183,7 +185,7 @@ def _beside(conditions: Conditions, measure: str, ours: Estimate, status: int) -
 
 
 def _published(at: Conditions, measure: str) -> tuple[Estimate | None, int]:
-    """The published estimate of a measure, and its N: that of the same N if there is one, else the paper's usual."""
+    """The published estimate of a measure, and its N: of the same N if there is one, else of the paper's usual N."""
     if at.boundary != "walls":
         return None, 0
     if at.bits:
@@ -213,7 +215,7 @@ def _closest(
 
 
 def comparison_rows(rows: Sequence[Compared]) -> list[dict[str, Any]]:
-    """A line for each measure: conditions, ours, the published, the difference."""
+    """A row for each measure: conditions, our estimate, the published one, and the difference."""
     lines = []
     for row in rows:
         theirs = row.theirs or Estimate(math.nan, math.nan, 0)
@@ -227,7 +229,7 @@ def comparison_rows(rows: Sequence[Compared]) -> list[dict[str, Any]]:
 
 
 def write_csv(path: Path, lines: Sequence[Mapping[str, Any]]) -> None:
-    """A table whose lines have the same names.
+    """Write a table whose lines have the same names.
 
     Raises:
         OSError: if it cannot be written.
@@ -239,16 +241,16 @@ def write_csv(path: Path, lines: Sequence[Mapping[str, Any]]) -> None:
 
 
 def read_csv(path: Path) -> list[Compared]:
-    """Ours of a table of `comparison_rows`, beside the points that are published as far as is known now.
+    """Our estimates from a table of `comparison_rows`, beside the published points that are known now.
 
     Raises:
         OSError: if it cannot be read.
-        KeyError: if it is no such table.
+        KeyError: if it is not such a table.
     """
     kinds, found = get_type_hints(Conditions), []
     with path.open(newline="", encoding="utf-8") as file:
         for line in csv.DictReader(file):
-            # Tables of runs between walls alone were written before there were others.
+            # Older tables have no column "boundary": all their boxes have walls.
             conditions = Conditions(**{name: kind(line[name]) for name, kind in kinds.items() if name in line})
             ours = Estimate(float(line["mean"]), float(line["sd"] or math.nan), int(line["packs"]))
             found.append(_beside(conditions, line["measure"], ours, int(line["status"])))

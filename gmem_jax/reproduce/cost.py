@@ -10,7 +10,7 @@ from gmem_jax.sweeps.spec import Spec
 
 
 def spec_of_all(names: Collection[str], scale: str) -> Spec:
-    """Every point that some of the figures, "claims" and "choices" need, once.
+    """The sweep of all points that some figures, "claims" or "choices" need, each once.
 
     Raises:
         ValueError: if there is no such scale.
@@ -23,7 +23,7 @@ def spec_of_all(names: Collection[str], scale: str) -> Spec:
     if "choices" in names:
         own = scale_of(scale, choices.SIZES)
         wanted += [_at(own, values) for values in choices.choice_points(packs(own, own.grains, own.few))]
-    if list(names) == ["fig03"]:  # no more than packs, and those are of figures 11 and 12b, too
+    if list(names) == ["fig03"]:  # it needs only packs; figures 11 and 12b have them, too
         wanted = [_at(size, values) for values in shown_packs(size)]
     once = {json.dumps(values, sort_keys=True): values for values in wanted}
     return Spec(extra=tuple(once.values()), run={AS_THEY_ARE: True})

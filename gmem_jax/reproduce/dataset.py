@@ -19,7 +19,7 @@ from gmem_jax.reproduce.compare import ComputedPoint, counted
 from gmem_jax.sweeps.store import Store
 
 COLLECTED = ("fig06", "fig08", "fig09", "fig11", "fig12a", "fig12b", "fig13")
-"""Figures whose points are in it; the others show the same points, or none."""
+"""Figures whose points are in the archive; the other figures show the same points, or none."""
 
 README = """# Recalled waveforms of granular packs
 
@@ -50,11 +50,11 @@ def write_dataset(path: Path, store: Store, points: Sequence[ComputedPoint], sca
     """Write the archive (ZIP): README.md, points.csv, and the files of the recalls as they are.
 
     Args:
-        path: of the archive; one of before is replaced.
-        store: where the recalls lie.
-        points: that are in it.
-        scale: of the figures, as it was asked for.
-        t0: of that scale, in t_c: says which G and F count.
+        path: path of the archive; an older one is replaced.
+        store: the store with the recalls.
+        points: the points of the archive.
+        scale: scale of the figures, as it was asked for.
+        t0: t0 of that scale, in t_c, which decides which G and F count (`counted`).
 
     Raises:
         OSError: if it cannot be written.

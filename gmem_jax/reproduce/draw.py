@@ -36,8 +36,8 @@ SYMBOLS = "osD^v<>pPX"
 STYLES = ("-", "--", ":", "-.")
 VECTOR = (".svg",)
 OURS, THEIRS, EITHER = "#1f5fa8", "#d1491b", "0.35"
-MARKER_SPACING = 6.0  # printer's points between markers of one place: none lies under another
-LINE = 0.062  # of the height of a panel, that a line of its legend takes
+MARKER_SPACING = 6.0  # printer's points between markers at one place, so that none hides another
+LINE = 0.062  # height of a line of the legend, over that of its panel
 
 
 def _panel(measure: str) -> str:
@@ -52,7 +52,7 @@ def _written(name: str, value: Any) -> str:
 
 
 def _series(row: Compared, varied: Sequence[str]) -> str:
-    """What tells a row's curve from the others."""
+    """The name of a row's curve: the conditions that differ between curves, and the reader."""
     at = asdict(row.conditions)
     reader = row.measure.partition(" ")[2]
     return ", ".join(filter(None, [*(_written(name, at[name]) for name in varied), reader]))
@@ -63,7 +63,7 @@ def _sizes(sizes: Iterable[int]) -> str:
 
 
 def said_of(rows: Sequence[Compared], rate: str) -> str:
-    """The line under a title: our sizes, rate (t0 in t_c) and packs, and what error bars are."""
+    """The line below a title: our N, t0 (`rate`, in t_c) and number of packs, and the meaning of error bars."""
     counts = sorted({row.ours.packs for row in rows})
     over = f"{counts[0]} to {counts[-1]} packs" if len(counts) > 1 else plural(counts[0], "pack")
     own = "one pack" if counts == [1] else f"mean ± SE over {over}"
@@ -73,13 +73,13 @@ def said_of(rows: Sequence[Compared], rate: str) -> str:
 
 
 def draw_comparison(path: Path, rows: Sequence[Compared], across: Sequence[str], title: str) -> None:
-    """G and F against a condition, ours and the published points in two colours; a symbol for each curve.
+    """Draw G and F against a condition, ours and the published points in two colours; a symbol for each curve.
 
     Args:
         path: file to write.
-        rows: what to show.
-        across: the condition; or several, each with a line of panels for the rows that only it varies.
-        title: over the picture.
+        rows: the measures to show.
+        across: the condition; or several, each with a line of panels for the curves that vary it.
+        title: title above the picture.
 
     Raises:
         OSError: if it cannot be written.
@@ -98,13 +98,13 @@ def draw_comparison(path: Path, rows: Sequence[Compared], across: Sequence[str],
 
 
 def _others(across: str) -> list[str]:
-    """The conditions that tell curves against one from each other. With an overlap of 1 a grain is a sphere."""
+    """The conditions that distinguish curves against `across`; if that is the overlap, not the shape (1: a sphere)."""
     same = {across, "shape"} if across == "overlap" else {across}
     return [name for name in Conditions.__dataclass_fields__ if name not in same]
 
 
 def _varying(rows: Sequence[Compared], across: str) -> list[Compared]:
-    """The rows of curves that have more than one place along a condition."""
+    """The rows of curves with more than one point along a condition."""
     curves: dict[tuple[Any, ...], list[Compared]] = {}
     for row in rows:
         curves.setdefault((row.measure, *(getattr(row.conditions, name) for name in _others(across))), []).append(row)
@@ -129,7 +129,7 @@ def _curves(axis: Any, rows: Sequence[Compared], across: str, panel: str) -> Non
 
 
 def _with_friction(axis: Any, rows: Sequence[Compared]) -> Sequence[Compared]:
-    """The rows that have friction, if there are others too: those are said in words, for any G may come out of them."""
+    """The rows with friction, if there are both kinds. G without friction may be any number: it is a text."""
     kept = [row for row in rows if row.conditions.mu]
     without = [row for row in rows if not row.conditions.mu]
     if not kept or not without:
@@ -146,7 +146,7 @@ def _place(row: Compared, across: str, words: Sequence[str]) -> float:
 
 
 def _curve(axis: Any, rows: Sequence[Compared], across: str, words: Sequence[str], place: int, shifted: float) -> None:
-    """Ours, and the published points beside them; `shifted` by so many distances of markers."""
+    """Draw our points and the published ones beside them, `shifted` by this number of marker spacings."""
     symbol, style = SYMBOLS[place % len(SYMBOLS)], STYLES[place % len(STYLES)]
     rows = sorted(rows, key=lambda row: _place(row, across, words))
     ours = [(_place(row, across, words), row.ours) for row in rows]
@@ -166,12 +166,12 @@ def _points(axis: Any, points: Sequence[tuple[float, Estimate]], shifted: float,
     fixed = {"markersize": 5, "capsize": 2, "linewidth": 1}
     axis.errorbar(x, y, error, transform=axis.transData + aside, **fixed, **style)
     low, high = np.subtract(y, error), np.add(y, error)
-    axis.update_datalim(np.column_stack([[*x, *x], [*low, *high]]))  # which moved points do not do by themselves
+    axis.update_datalim(np.column_stack([[*x, *x], [*low, *high]]))  # shifted points do not update them
     axis.autoscale_view()
 
 
 def _legend(axis: Any, rows: Sequence[Compared], across: str, labels: Sequence[str]) -> None:
-    """Whose the colours are and at which N, and what the symbols are; in room of its own over all points."""
+    """Draw a legend above all points: the colours, ours and published, with their N; and the symbols of curves."""
     on_axis = across == "grains"
     size = "" if on_axis else f", {_sizes(row.conditions.grains for row in rows)}"
     axis.plot([], [], "s", color=OURS, label=f"gmem_jax{size}")
@@ -193,7 +193,7 @@ def _legend(axis: Any, rows: Sequence[Compared], across: str, labels: Sequence[s
 
 
 def _published(rows: Sequence[Compared], across: str) -> dict[tuple[int, bool], list[tuple[Compared, Estimate]]]:
-    """The published points of a curve by their N, and whether it is ours; where N is the axis, each once, under 0."""
+    """The published points of a curve, by N and whether it is our N; all under (0, True) if N is the axis."""
     known = [(row, row.theirs) for row in rows if row.theirs]
     if across == "grains":
         return {(0, True): list({row.grains: (row, theirs) for row, theirs in known}.values())} if known else {}
@@ -221,7 +221,7 @@ def _axis(axis: Any, across: str, words: Sequence[str], label: str) -> None:
         axis.set_xlim(low - 0.5, high + 0.5)
     if across in LOGARITHMIC:
         axis.set_xscale("log")
-        # Few places, less than decades apart: each is named, where matplotlib would write 3 x 10^2 over 4 x 10^2.
+        # There are few places, less than a decade apart: matplotlib's labels would overlap, so that each gets its own.
         places = sorted({float(x) for line in axis.get_lines() for x in np.atleast_1d(line.get_xdata())})
         axis.set_xticks(places, [f"{x:,.0f}" if x >= 1.0 else f"{x:g}" for x in places])
         axis.set_xticks([], minor=True)
@@ -231,7 +231,8 @@ def power(sizes: Mapping[int, Estimate]) -> tuple[float, float]:
     """The exponent k of G ~ N^k by least squares, and its standard error.
 
     Args:
-        sizes: G by N. If all have a standard error they count by it; else alike, and the exponent has none (NaN).
+        sizes: G by N. If all have a standard error, they are weighted by it; else all count alike, and the exponent has
+            no error (NaN).
 
     Returns:
         Exponent and error; NaN for fewer than two sizes.
@@ -270,7 +271,7 @@ def _power_law(axis: Any, rows: Sequence[Compared]) -> None:
 
 
 def through_time(path: Path, recall: Recall, signal: int, title: str) -> None:
-    """phi, Z, contacts, pressures and p_xy of every stage, with a signal and with none, like the paper's Fig. 4.
+    """Draw phi, Z, contacts, pressures and p_xy of every stage, with and without a signal, like the paper's Fig. 4.
 
     Raises:
         OSError: if it cannot be written.
@@ -310,7 +311,7 @@ def through_time(path: Path, recall: Recall, signal: int, title: str) -> None:
 
 
 def waveforms(path: Path, bits: int = 5) -> None:
-    """The six waveforms and some words of a length: I solid, J dashed, like the paper's Fig. 5.
+    """Draw the six waveforms and some words of a length: I solid, J dashed, like the paper's Fig. 5.
 
     Raises:
         OSError: if it cannot be written.
@@ -343,15 +344,15 @@ def waveforms(path: Path, bits: int = 5) -> None:
 
 
 def words_figure(path: Path, recalls: Sequence[Recall], shown: Sequence[Sequence[int]], title: str) -> None:
-    """Recalled words (SUB2-BL) beside their scaled integrals, a line of panels for each length, like Fig. 13.
+    """Draw recalled words (SUB2-BL) beside their scaled integrals, a line of panels for each length, like Fig. 13.
 
-    Where the drive rings, what counts is drawn over it: the running mean over the ringing period.
+    If t0 is below the paper's, the running mean over the ringing period is drawn over the recall.
 
     Args:
         path: file to write.
-        recalls: of all words of a length.
-        shown: which words of each to draw.
-        title: over the picture.
+        recalls: recalls of all words of a length, one for each length.
+        shown: numbers of the words to draw, for each recall.
+        title: title above the picture.
 
     Raises:
         OSError: if it cannot be written.

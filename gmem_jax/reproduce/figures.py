@@ -16,8 +16,8 @@ Values = dict[str, Any]
 """Names of a sweep file with the values of one point."""
 
 DELTA0 = 0.05  # the paper's compression, and that of every shipped pack
-CALIBRATED = tuple(f"tetra-10240-{x}" for x in "abc")  # by whose G k_H was chosen: not for law H with friction
-MADE = 101  # seed of the first pack that is made: the shipped ones have small seeds
+CALIBRATED = tuple(f"tetra-10240-{x}" for x in "abc")  # k_H was chosen by their G, so that they do not test it
+MADE = 101  # seed of the first pack that is made; shipped packs have small seeds
 SHAPES: list[Values] = [{"shape": "sphere"}, *({"overlap": overlap} for overlap in (0.7, 0.8, 0.9))]
 SHOWN_WORD = 683  # of ten bits, in the paper's Fig. 13
 
@@ -28,13 +28,13 @@ class Scale:
 
     Attributes:
         t0: duration of one compression, in t_c.
-        grains: N of the figures that vary something else.
-        packs: packs a point.
-        few: packs a point where each point needs packs of its own.
+        grains: N of the figures that do not vary it.
+        packs: number of packs of a point.
+        few: number of packs of a point, if each point needs its own packs.
         sizes: N of the figures that vary it.
-        lengths: of words, in bits.
-        nets: trained for each length of words, from different seeds.
-        budget: longest training of one, in seconds.
+        lengths: lengths of words, in bits.
+        nets: number of nets for each length of words, from different seeds.
+        budget: longest training of a net, in seconds.
     """
 
     t0: float
@@ -59,10 +59,10 @@ def scale_of(text: str, scales: Mapping[str, Scale] = SCALES) -> Scale:
 
     Args:
         text: the name, and after commas any of the fields of `Scale` with other numbers; + joins several.
-        scales: that have a name.
+        scales: the scales by name.
 
     Raises:
-        ValueError: saying what cannot be, and what could.
+        ValueError: saying what is wrong, and what would be right.
     """
     name, *changes = text.split(",")
     if name not in scales:
@@ -92,9 +92,9 @@ class PaperFigure(NamedTuple):
     """A figure of the paper.
 
     Attributes:
-        title: what it shows.
-        points: the values of every point at a scale.
-        across: the condition on the horizontal axis, where there is one, or several; see `compare.Conditions`.
+        title: title of the figure.
+        points: gives the values of every point at a scale.
+        across: the conditions on the horizontal axes, if any; see `compare.Conditions`.
     """
 
     title: str
@@ -103,13 +103,13 @@ class PaperFigure(NamedTuple):
 
 
 def packs(scale: Scale, grains: int, count: int, delta0: float = DELTA0, **grain: Any) -> list[Values]:
-    """What names `count` packs of a size: shipped ones as far as there are any, then some to be made at the scale's t0.
+    """Values that name `count` packs of a size: first shipped packs, then packs to be made at the scale's t0.
 
     Args:
-        scale: for the rate of preparation.
+        scale: the scale, for t0 of the preparation.
         grains: N.
-        count: how many.
-        delta0: compression that they are cycled with.
+        count: number of packs.
+        delta0: compression with which they are cycled.
         grain: shape and overlap, if not the paper's tetra grain; and the boundary, if not walls.
     """
     shipped = [name for name in list_packs() if name.startswith(f"tetra-{grains}-") and name not in CALIBRATED]
@@ -135,7 +135,7 @@ def _one(scale: Scale) -> list[Values]:
 
 
 def shown_packs(scale: Scale) -> list[Values]:
-    """The packs of Fig. 3: every size, and every shape of Fig. 11's inset; the same packs as there."""
+    """The packs of Fig. 3: one of every size, and one of every shape in the inset of Fig. 11."""
     return [
         *(packs(scale, grains, 1)[0] for grains in scale.sizes),
         *(packs(scale, scale.grains, 1, **shape)[0] for shape in SHAPES),

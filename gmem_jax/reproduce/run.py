@@ -66,12 +66,12 @@ MOST_SHOWN = 8  # words of a length in Fig. 13
 
 
 class Schematic(NamedTuple):
-    """A figure of the paper that no experiment has to be run for.
+    """A figure of the paper that needs no experiments.
 
     Attributes:
-        title: what it shows.
-        draw: writes it to a file, as SVG and, where it has numbers, as CSV beside it; what came out, for a line.
-        has_numbers: whether it does.
+        title: title of the figure.
+        draw: writes the figure to a file, as SVG beside it, and its numbers, if any, as CSV; gives results to print.
+        has_numbers: whether it has numbers.
     """
 
     title: str
@@ -85,15 +85,15 @@ SCHEMATICS = {
     "fig10": Schematic("one contact under every law, beside closed forms", laws_figure, has_numbers=True),
     "fig15": Schematic("M2 with more and more points", convergence_figure, has_numbers=True),
 }
-GALLERY = "fig03"  # pictures of packs, which may have to be made
+GALLERY = "fig03"  # pictures of packs, some of which may have to be made
 
 
 class Weighed(NamedTuple):
-    """What the paper leaves open came to.
+    """The effects of the choices that the paper leaves open.
 
     Attributes:
-        effects: of every value of every choice.
-        files: what was written.
+        effects: effects of every value of every choice.
+        files: the files written.
         failed: reasons of points that failed.
     """
 
@@ -103,12 +103,12 @@ class Weighed(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What a figure came to.
+    """The result of a figure.
 
     Attributes:
-        name: of the figure.
+        name: name of the figure.
         rows: its measures beside the published ones.
-        files: what was written.
+        files: the files written.
         failed: reasons of points that failed.
     """
 
@@ -120,20 +120,20 @@ class Outcome(NamedTuple):
 
 @dataclass(frozen=True)
 class Reproduction:
-    """Makes figures and judges claims of the paper; runs nothing again that is there.
+    """Makes figures and tests claims of the paper. Finished runs in its folder are not run again.
 
     Attributes:
-        folder: for what is written, and for the runs that all figures share; made if it is not there.
+        folder: folder for figures and tables, and for the runs, which all figures share; made if it does not exist.
         scale: a name of `SCALES`, or one with changes: see `scale_of`.
-        executor: does the runs; default processes of this machine.
-        progress: told about them.
-        say: told in a line what is planned, what happened, and why recalls are doubtful.
-        statuses: takes the status of every recall that was looked at.
+        executor: runs the points; default processes of this machine.
+        progress: called with the progress of the runs.
+        say: called with lines of text on what is planned, what happened, and why recalls are doubtful.
+        statuses: gets the status of every recall.
 
     Raises:
-        ValueError: by its methods if there is no such scale, or JAX runs in 32 bits.
-        RunFailedError: if workers die again and again.
-        OSError: if something cannot be written, or no worker started.
+        ValueError: by its methods, if there is no such scale, or JAX runs in 32 bits.
+        RunFailedError: by its methods, if workers die again and again.
+        OSError: by its methods, if something cannot be written, or no worker can be started.
     """
 
     folder: Path
@@ -144,7 +144,7 @@ class Reproduction:
     statuses: list[int] = field(default_factory=list, compare=False)
 
     def figure(self, name: str) -> Outcome:
-        """Run what is missing of a figure of `FIGURES`, and write its picture (PNG, SVG) and its table (CSV).
+        """Run the missing points of a figure of `FIGURES`, and write its picture (PNG, SVG) and its table (CSV).
 
         Raises:
             ValueError: if there is no such figure.
@@ -169,9 +169,9 @@ class Reproduction:
         return Outcome(name, measured, _written(target), failed)
 
     def picture(self, name: str) -> list[Path]:
-        """Draw a figure that needs no experiments: one of `SCHEMATICS`, or the packs of `GALLERY`; the files written.
+        """Draw a figure that needs no experiments: one of `SCHEMATICS`, or the packs of `GALLERY`.
 
-        Nothing but `GALLERY` depends on the scale.
+        Only `GALLERY` depends on the scale. Gives the files written.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         if name != GALLERY:
@@ -185,10 +185,10 @@ class Reproduction:
         return [target]
 
     def sensitivity(self) -> Weighed:
-        """Run every choice that the paper leaves open with other values, on the same packs; writes choices-SCALE."""
+        """Run every choice that the paper leaves open with other values, on the same packs, and write choices-SCALE."""
         size = scale_of(self.scale, choices.SIZES)
         named = packs(size, size.grains, size.few)
-        same = {AS_THEY_ARE: True}  # a choice is weighed on the same packs
+        same = {AS_THEY_ARE: True}  # all values of a choice are run on the same packs
         spec = Spec(shared={"t0": size.t0}, extra=tuple(choices.choice_points(named)), run=same)
         store = self._run(spec).store
         done = store.done()
@@ -202,10 +202,10 @@ class Reproduction:
         return Weighed(found, _written(target), _failed(store))
 
     def dataset(self) -> tuple[list[Path], list[str]]:
-        """Run what is missing of the figures `COLLECTED`, and write their recalls as one archive, dataset-SCALE.zip.
+        """Run the missing points of the figures `COLLECTED`, and write their recalls as one archive, dataset-SCALE.zip.
 
         Returns:
-            The files written, and why points failed.
+            The files written, and the reasons of points that failed.
         """
         require_x64()
         store = self._run(spec_of_all(COLLECTED, self.scale)).store
@@ -215,10 +215,10 @@ class Reproduction:
         return [target] if points else [], _failed(store)
 
     def claims(self) -> list[Verdict]:
-        """Run what the claims of the paper need, on one pack, and judge them; writes claims-SCALE.json.
+        """Run the points that the claims of the paper need, on one pack, test the claims, and write claims-SCALE.json.
 
         Raises:
-            RunFailedError: if a point of a claim failed: it cannot be judged.
+            RunFailedError: if a point failed, so that a claim cannot be tested.
         """
         size = scale_of(self.scale)
         (named,) = packs(size, size.grains, 1)
@@ -240,7 +240,7 @@ class Reproduction:
         return SweepRunner(spec, self.folder / RUNS, self.say, cost=cost)
 
     def _run(self, spec: Spec) -> SweepRunner:
-        """Do what is missing of a sweep, whose runner has done it."""
+        """Run the missing points of a sweep; gives its runner."""
         runner = self._runner(spec, quick_cost(spec.extra))
         runner.run(self.executor or Processes(), self.progress)
         table = rows(runner.store)
@@ -250,11 +250,11 @@ class Reproduction:
         return runner
 
     def _target(self, name: str, suffix: str = ".png") -> Path:
-        """Where a figure of a scale is written: changes of the scale are in its name."""
+        """The file of a figure; its name has the scale with its changes."""
         return self.folder / f"{name}-{self.scale.replace(',', '-')}{suffix}"
 
     def _read_words(self, store: Store, points: Sequence[ComputedPoint], size: Scale) -> list[Compared]:
-        """How well recalled words are read, by nets that have seen inputs only, and by the baselines.
+        """Accuracies with which recalled words are read, by nets that were trained on inputs only and by the baselines.
 
         Nets are trained once and kept in the folder.
         """
@@ -280,9 +280,9 @@ class Reproduction:
 
 
 def quick_cost(points: Sequence[Values]) -> float:
-    """Seconds a grain-step here with `SIDE_BY_SIDE` replicas, over some points.
+    """Mean seconds per grain-step on this machine with `SIDE_BY_SIDE` replicas, over some points.
 
-    A second's measurement for each law, on the pack nearest in size.
+    It is measured for a second for each law, on the shipped pack that is nearest in size.
     """
     work: dict[tuple[str, str], float] = {}
     for values in points:
@@ -302,7 +302,7 @@ def _written(target: Path) -> list[Path]:
 
 
 def _failed(store: Store) -> list[str]:
-    """Why points of the last sweep failed, in a list as long as they are many."""
+    """The reasons of all failed points of the latest sweep."""
     failed = store.failed()
     return sorted(failed[row["key"]] for row in store.card()["points"] if failed.get(row["key"]))
 
@@ -337,7 +337,7 @@ def _draw(
 
 
 def _shown(bits: int) -> list[int]:
-    """Words of a length that are drawn: all eight of three bits; of longer ones some, and the paper's of ten."""
+    """Numbers of the words that are drawn: all eight of three bits, some of longer ones, and the paper's one of ten."""
     count = 1 << bits
     chosen = sorted({round((k + 0.5) * count / MOST_SHOWN - 0.5) for k in range(MOST_SHOWN)})
     return [SHOWN_WORD - 1] if bits == 10 else chosen

@@ -31,7 +31,7 @@ DRIVEN_LAWS: dict[str, FrictionLaw] = {
     M2: Mindlin(**FREE, p_max=P_MAX),
     M2_PAPER: Mindlin(**FREE, p_max=P_MAX, variant="paper"),
 }
-POINT_COUNTS = (20, 35, 60, 100, 180, 400)  # of M2's points
+POINT_COUNTS = (20, 35, 60, 100, 180, 400)  # numbers of points of M2
 DRAWN_LAWS = (("paper, without h", 20), ("paper, with h", 20), ("paper, with h", 100), ("averaged (default)", 20))
 
 
@@ -51,16 +51,16 @@ def _force(law: FrictionLaw, overlap: np.ndarray, displacement: np.ndarray) -> n
 
 
 def led(points: int) -> tuple[np.ndarray, np.ndarray, slice]:
-    """Overlap and displacement along the path, `points` to a segment, and which of them are on the last."""
+    """Overlap and displacement along the path, with `points` points on each segment; and the last segment's slice."""
     overlap, displacement = np.asarray(polyline(jnp.asarray(CORNERS), points)).T
     return overlap, displacement, slice((len(CORNERS) - 2) * points, None)
 
 
 def laws_figure(path: Path, points: int = 200) -> dict[str, float]:
-    """The path, the force of every law along it, and on unloading beside the closed forms; also as CSV.
+    """Draw the path, the force of every law along it, and the unloading beside the closed forms; also write a CSV.
 
     Returns:
-        By law, the largest deviation from the closed form, in units of the stiffness.
+        The largest deviation from the closed form by law, in units of the stiffness.
 
     Raises:
         OSError: if they cannot be written.
@@ -102,7 +102,7 @@ def laws_figure(path: Path, points: int = 200) -> dict[str, float]:
 @pytree
 @dataclass(frozen=True)
 class WithoutH(Mindlin):
-    """App. D.2 without its h term: the outermost ring counts in full as soon as it is reached."""
+    """M2 of App. D.2 without its h term: the outermost ring counts in full as soon as it is reached."""
 
     def weights(self, x: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """See `Mindlin.weights`."""
@@ -123,10 +123,11 @@ FORMS = ("paper, without h", "paper, with h", "exact weights", "averaged (defaul
 
 
 def convergence_figure(path: Path, points: int = 1000) -> dict[str, list[float]]:
-    """M2's force on unloading for several numbers of points and weights, and its error against them; also as CSV.
+    """Draw M2's force on unloading for several numbers of points and kinds of weights, and its error; also write a CSV.
 
     Returns:
-        By weights, the root mean square deviation from the exact force for each of `POINT_COUNTS` points, in k_M R^1.5.
+        The root mean square deviation from the exact force by kind of weights, for each of `POINT_COUNTS`, in
+        k_M R^1.5.
 
     Raises:
         OSError: if they cannot be written.
@@ -170,7 +171,7 @@ def convergence_figure(path: Path, points: int = 1000) -> dict[str, list[float]]
 
 
 def write_columns(path: Path, names: list[str], columns: list[np.ndarray]) -> None:
-    """A CSV of columns.
+    """Write columns as CSV.
 
     Raises:
         OSError: if it cannot be written.

@@ -1,9 +1,9 @@
-"""The two-grain picture of the memory (Fig. 7): a contact that forms on the way in keeps the shear it formed at.
+"""The two-grain picture of the memory (Fig. 7): a contact keeps the shear at which it formed in the compression.
 
-Two grains move with the walls, apart by a gap that the compression closes at some u_c. From then on their friction
-force follows the shear: k (gamma(u) - gamma(u_c)) R. At u = 1 the shear is gone and -k gamma(u_c) R is left: one
-contact keeps one value of the waveform. On the way back it is let go where it was taken up, at u_c. Contacts of all
-u_c together hold the integral of gamma, and lose it from its end: they read it out reversed.
+Two grains move with the walls; between them is a gap that the compression closes at u = u_c. From then on their
+friction force follows the shear: k (gamma(u) - gamma(u_c)) R. At u = 1 the shear is zero again and the force is
+-k gamma(u_c) R: one contact keeps one value of the waveform. On decompression it breaks at u_c, and the force vanishes.
+Contacts of all u_c together hold the integral of gamma. They lose it from its end, which reads it out reversed.
 """
 
 from dataclasses import dataclass
@@ -24,21 +24,21 @@ from gmem_jax.reproduce.single_contact import write_columns
 from gmem_jax.show.render_matplotlib import pyplot, save_picture
 from gmem_jax.simulation.stage import BINS, bin_centres
 
-STORE = 0.2  # t0, in the picture
-POINTS_PER_BIN = 4  # points to a bin
+STORE = 0.2  # t0, duration of the storage in the picture
+POINTS_PER_BIN = 4  # points in a bin
 DRAWN_AT = (0.3, 0.5, 0.7)  # u_c of the contacts whose force is drawn
 SIGNAL = 5
 
 
 @dataclass(frozen=True)
 class Story:
-    """What happened to M contacts.
+    """The history of M contacts at T times.
 
     Attributes:
         closes: u at which each contact forms, [M].
-        time: since the compression began, [T], in t0: compression to 1, storage, decompression.
-        u: [T].
-        shear: gamma, [T].
+        time: time since the compression began, [T], in t0; the compression ends at 1, then storage and decompression.
+        u: compression variable, [T].
+        shear: shear strain gamma, [T].
         force: friction force that resists the shear, [T, M], in E R^2.
     """
 
@@ -50,19 +50,19 @@ class Story:
 
     @property
     def recalled(self) -> np.ndarray:
-        """The mean force on decompression, in each bin of ascending u, its sign that of a recalled signal, [256]."""
+        """The mean force on decompression in each bin of ascending u, with the sign of a recalled signal, [256]."""
         back = self.force[-BINS * POINTS_PER_BIN :].mean(axis=1)
         binned: np.ndarray = -back.reshape(BINS, POINTS_PER_BIN).mean(axis=1)[::-1]
         return binned
 
 
 def tell(closes: np.ndarray, signal: Signals, law: FrictionLaw | None = None, gamma0: float = 1e-3) -> Story:
-    """Compress contacts along the box's diagonal with a sheared box, hold them, and decompress them; quasi-static.
+    """Compress contacts along the box's diagonal in a sheared box, hold them, and decompress them, quasi-statically.
 
     Args:
         closes: u at which the two grains of each pair touch, [M], within (0, 1).
-        signal: one waveform, for all of them.
-        law: of friction; default `Hooke()`.
+        signal: one waveform, for all contacts.
+        law: friction law; default `Hooke()`.
         gamma0: shear amplitude.
     """
     closes = np.asarray(closes, float)
@@ -70,7 +70,7 @@ def tell(closes: np.ndarray, signal: Signals, law: FrictionLaw | None = None, ga
     u = np.concatenate([[0.0], way, np.ones(round(STORE * BINS * POINTS_PER_BIN)), 1.0 - way])
     time = np.arange(len(u)) / (BINS * POINTS_PER_BIN)
     shear = np.where(time <= 1.0, gamma0 * np.asarray(signal.shear(jnp.asarray(u)))[:, 0], 0.0)
-    # Affine: centres 2 R apart come closer by 2 R times the strain of an axis, and slide by R gamma.
+    # Affine motion: centres 2 R apart come closer by 2 R times the strain of an axis, and slide by R gamma.
     overlap = 2.0 * (1.0 - np.sqrt(1.0 - DELTA0)) * (u[:, None] - closes)
     law = Hooke() if law is None else law
     force = jax.vmap(lambda p: contact_path(law, p, jnp.asarray(shear)), in_axes=1, out_axes=1)(jnp.asarray(overlap))
@@ -78,15 +78,15 @@ def tell(closes: np.ndarray, signal: Signals, law: FrictionLaw | None = None, ga
 
 
 def two_grains_figure(path: Path, count: int = 96, gamma0: float = 1e-3) -> dict[str, float]:
-    """The two grains, the force in three such contacts, and what many recall together; also as CSV.
+    """Draw the two grains, the force in three such contacts, and the recall of many contacts; also write a CSV.
 
     Args:
         path: file to write.
-        count: contacts, that form at as many u.
+        count: number of contacts, which form at equally spaced u.
         gamma0: shear amplitude.
 
     Returns:
-        Fidelity of what all contacts recall.
+        Fidelity of the recall of all contacts.
 
     Raises:
         OSError: if they cannot be written.
@@ -129,7 +129,7 @@ def two_grains_figure(path: Path, count: int = 96, gamma0: float = 1e-3) -> dict
 
 
 def _sketch(axis: Any) -> None:
-    """Two grains in the corners of their box, before and after they touch."""
+    """Draw two grains in the corners of their box, before and after they touch."""
     plt = pyplot()
     for place, edge, words in ((0.0, 3.75, "u < $u_c$: apart"), (4.9, 3.3, "u > $u_c$: in contact")):
         axis.add_patch(plt.Rectangle((place, -0.5 * edge), edge, edge, fill=False, linewidth=1.5))
