@@ -36,7 +36,7 @@ _LISTED = {  # the commands in their order: the module of each, and the beginnin
     "reproduce": ("reproduce", "Run a figure of the paper again, beside the published points."),
     "bench": ("benchmark", "Measure what a grain-step costs."),
 }
-_ELSEWHERE = {  # what is not a command and near none, and how it is done
+_ELSEWHERE = {  # words that are not commands, nor spelt like one, and how to do what they mean
     "view": "gm.view shows a pack or a recall in a notebook, gmem report FILE as a page for a browser",
     "run": "gmem recall runs an experiment, gmem sweep many",
     "plot": "gmem show FILE --plot WHAT -o x.png draws what a file holds",
@@ -49,7 +49,7 @@ _ELSEWHERE = {  # what is not a command and near none, and how it is done
 
 
 def _typer_s_own_are_off(params: list[Any]) -> list[Any]:
-    """The same: --help and the like, not given, are False; for a None typer imports pydantic, a tenth of a second."""
+    """The parameters, with False as default of --help and the like: for None typer imports pydantic, in 0.1 s."""
     for one in params:
         if not one.expose_value and one.default is None:
             one.default = False
@@ -57,7 +57,7 @@ def _typer_s_own_are_off(params: list[Any]) -> list[Any]:
 
 
 class _Commands(TyperGroup):
-    """The list of commands. What each needs, JAX and all, is imported when it is called or asked for its own help."""
+    """The list of commands. The modules of a command, and JAX, are imported when it is called or its help is shown."""
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(**settings)
@@ -91,7 +91,7 @@ class _Command(TyperCommand):
         typed = [one for one in self.params if "COMMANDLINE" in str(ctx.get_parameter_source(str(one.name)))]
         GIVEN.set({str(one.name): "/".join(_longest(one.opts) + _longest(one.secondary_opts)) for one in typed})
         gmem_start.imported()
-        at_once = self.name == "info" and "jax" not in sys.modules  # the rules are JAX's, whose import takes a second
+        at_once = self.name == "info" and "jax" not in sys.modules  # these rules import JAX, which takes a second
         with nullcontext() if at_once else _rules_of_commands():
             return super().invoke(ctx)
 
@@ -113,7 +113,7 @@ def command_named(name: str) -> Any:
 
 @contextmanager
 def _rules_of_commands() -> Iterator[None]:
-    """JAX as commands need it: in double precision, with programs that are kept."""
+    """Set up JAX for commands: double precision, and a cache of compiled programs."""
     import jax
 
     from gmem_jax.files.compilation_cache import keep_programs
@@ -151,11 +151,11 @@ def _one_line(message: Warning | str, *_: Any, **__: Any) -> None:
 
 
 _OUT_OF_MEMORY = "out of memory; use fewer replicas (--batch) or a smaller pack"
-_NATIVE = "gmem_jax native: "  # what the library's own refusals begin with
+_NATIVE = "gmem_jax native: "  # prefix of the errors of the native library
 
 
 def _of_jax(error: Exception) -> str:
-    """What an error says that no line of ours raised, where the machine or its settings are at fault; else ""."""
+    """The message for an error that JAX raised because of the machine or its settings; else ""."""
     import jax
 
     from gmem_jax.physics.rules import StartError, why_not_started
@@ -171,7 +171,7 @@ def _of_jax(error: Exception) -> str:
 
 
 def _open_streams() -> None:
-    """Give closed standard streams a place to write to, which no file that is opened later may become."""
+    """Open closed standard streams on the null device, so that no file opened later gets their numbers."""
     for number in range(3):
         try:
             os.fstat(number)
@@ -187,7 +187,7 @@ def main() -> None:
     warnings.showwarning = _one_line
     try:
         code = app(args=sys.argv[1:] or ["--help"], prog_name="gmem", standalone_mode=False)
-        if code == INTERRUPTED:  # typer's word for Ctrl-C outside of a run
+        if code == INTERRUPTED:  # typer's code for Ctrl-C outside of a run
             raise KeyboardInterrupt
         sys.exit(code if isinstance(code, int) else 0)
     except TyperException as error:

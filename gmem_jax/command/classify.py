@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 @contextlib.contextmanager
 def _training(budget: float) -> Iterator["training.Listener"]:
-    """Loss and validation accuracy of a training: in a bar of its time on a terminal, a line now and then elsewhere."""
+    """Show loss and validation accuracy of a training: with a bar of its time on a terminal, else as lines."""
 
     def words(one: "training.Training") -> str:
         passed = f"seed {one.seed}: step {one.step}, loss {one.loss:.3f}"
@@ -64,7 +64,7 @@ def _training(budget: float) -> Iterator["training.Listener"]:
 
 
 def _chosen(found: Recall, file: Path, read: str, channel: str) -> Recall:
-    """The read and channel that were asked for, of a recall that may have several."""
+    """The part of a recall for the read and channel that were asked for."""
     for option, known, wanted in (("read", found.reads, read), ("channel", found.channels, channel)):
         if wanted not in known and (wanted or len(known) > 1):
             raise InputError(f"{file}: say --{option}, one of {', '.join(known)}")
@@ -93,7 +93,7 @@ def classify_command(
     """
     kept = _chosen(load_recall(recall), recall, read, channel)
     configuration = kept.configuration
-    # Here, not above: flax takes a second to load, and no other command needs it.
+    # Imported here, since flax takes a second to load and no other command needs it.
     from gmem_jax.reading import report, training
     from gmem_jax.reading.lessons import TrainingConfig
     from gmem_jax.reading.readers import stored_words

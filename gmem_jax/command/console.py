@@ -1,4 +1,4 @@
-"""Output of all commands: logs and progress on stderr, results on stdout, files that overwrite nothing unasked."""
+"""Output of all commands: logs and progress on stderr, results on stdout, and checks of output files."""
 
 import contextlib
 import errno
@@ -22,45 +22,45 @@ from gmem_jax.files.atomic import probe
 from gmem_jax.files.ours import promise
 from gmem_jax.files.printing import finite, printable
 
-if TYPE_CHECKING:  # what JAX is imported for, is imported where it is used: `gmem --help` needs none
+if TYPE_CHECKING:  # modules that import JAX are imported where they are used: `gmem --help` needs none
     from gmem_jax.show.figure import Figure
     from gmem_jax.simulation.progress import Progress
 
 
 def _give_up(stream: int) -> None:
-    """Send a stream nowhere from now on: what is still in its buffer would fail once more when Python ends."""
+    """Send a stream to the null device from now on; else the rest of its buffer would fail again when Python ends."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
 
 
 class _Log(Console):
-    """Lines that nobody may hear: no run ends because its log's reader is gone, or the disk of the log is full."""
+    """The log. A run does not end if the reader of its log is gone, or the disk of the log is full."""
 
     def print(self, *objects: Any, **options: Any) -> None:
-        """Print, if there is a place for it."""
+        """Print, unless the stream cannot be written."""
         try:
             super().print(*objects, **options)
         except OSError:
             self.on_broken_pipe()
 
     def on_broken_pipe(self) -> None:
-        """Be quiet from now on."""
+        """Print nothing from now on."""
         _give_up(2)
 
 
 class _Out(Console):
-    """Results, whose reader may leave: `heard` sees it. Rich would end the command as if it had failed."""
+    """The results. If their reader leaves, `heard` handles it; rich would end the command as if it had failed."""
 
     def on_broken_pipe(self) -> None:
-        """Say so."""
+        """Raise the error, for `heard`."""
         raise BrokenPipeError
 
 
-if not os.environ.get("COLUMNS", "1").strip("0"):  # not known; in no columns rich would print nothing at all
+if not os.environ.get("COLUMNS", "1").strip("0"):  # unknown width; at 0 columns rich would print nothing
     del os.environ["COLUMNS"]
 stderr = _Log(stderr=True, highlight=False, markup=False)  # markup would let names in files style or break a line
 out = _Out(highlight=False, markup=False)
 
-LONGEST_DURATION = 3e9  # seconds, a century: what is longer was not meant
+LONGEST_DURATION = 3e9  # seconds, a century: longer runs are a mistake
 LOG_INTERVAL = 30.0  # seconds between lines of progress where there is no terminal
 
 Output = Annotated[Path, typer.Option("-o", "--output", help="File to write.")]
@@ -76,7 +76,7 @@ KeptFrames = Annotated[
 PackName = Annotated[str, typer.Argument(help="A pack file, or the name of a pack that is shipped or made.")]
 
 
-# What was typed after the command that runs: the name on the command line of each option and argument by its own.
+# Options and arguments that were typed for the command that runs: parameters by name, as written on the command line.
 GIVEN: ContextVar[Mapping[str, str]] = ContextVar("GIVEN", default=MappingProxyType({}))
 
 
@@ -86,18 +86,18 @@ DryRun = Annotated[
 
 
 class InputError(ValueError):
-    """Bad input, in words for the command line."""
+    """Bad input, with a message for the command line."""
 
 
 def refuse_idle(why: str, *names: str) -> None:
     """Refuse options that were typed and would do nothing.
 
     Args:
-        why: they would not: ends the sentence "--frames-of does nothing ...".
-        names: of the parameters of the command.
+        why: end of the sentence "--frames-of does nothing ...".
+        names: names of the parameters of the command.
 
     Raises:
-        InputError: naming the first that was.
+        InputError: naming the first of them that was typed.
     """
     given = GIVEN.get()
     for name in names:
@@ -106,32 +106,32 @@ def refuse_idle(why: str, *names: str) -> None:
 
 
 class UnheardError(Exception):
-    """A result that stdout does not take, once all files are written."""
+    """The result could not be written to stdout; all files are written."""
 
 
 BEGINS_ANEW = "nothing was kept yet; the same command begins anew"
 
 
 class RunInterruptedError(Exception):
-    """Ctrl-C in a run, and how to go on; no KeyboardInterrupt, which typer makes an exit without words."""
+    """Ctrl-C in a run, with how to go on. It is not a KeyboardInterrupt, at which typer exits without a message."""
 
 
 def log(line: str, **style: Any) -> None:
-    """A line of the log."""
+    """Print a line of the log."""
     stderr.print(printable(line), soft_wrap=True, markup=False, **style)
 
 
 @contextlib.contextmanager
 def heard() -> Iterator[None]:
-    """What is written to stdout in the block arrives there, or its reader has left.
+    """Make sure that the output of the block is written to stdout, unless the reader of stdout has left.
 
     Raises:
-        UnheardError: if stdout takes nothing.
+        UnheardError: if stdout cannot be written.
     """
     try:
         yield
         sys.stdout.flush()
-    except BrokenPipeError:  # as of `| head`, which has what it wanted
+    except BrokenPipeError:  # as with `| head`, which has read enough
         _give_up(1)
     except OSError as error:
         _give_up(1)
@@ -139,10 +139,10 @@ def heard() -> Iterator[None]:
 
 
 def print_result(as_json: bool, result: Any, *tables: Any) -> None:
-    """The result: one JSON object, or tables and lines for a person.
+    """Print the result: one JSON object, or tables and lines for a person.
 
     Raises:
-        UnheardError: if stdout takes nothing.
+        UnheardError: if stdout cannot be written.
     """
     with heard():
         if as_json:
@@ -155,7 +155,7 @@ def print_result(as_json: bool, result: Any, *tables: Any) -> None:
 
 
 def _fitted(table: Table) -> list[Table]:
-    """A table that is no wider than the terminal; where its columns do not fit side by side, a table for each row."""
+    """The table, no wider than the terminal; if its columns do not fit side by side, a table for each row."""
     if _keep_whole(table) <= out.width or not (out.is_terminal or os.environ.get("COLUMNS")):
         return [table]
     if len(table.columns) < 3:
@@ -173,10 +173,10 @@ def _fitted(table: Table) -> list[Table]:
 
 
 def _keep_whole(table: Table) -> int:
-    """Let a table be as wide as its numbers and words, if the terminal is not: rich would cut them; that width."""
+    """Make a table so wide that rich cuts no number or word, even wider than the terminal; gives its width."""
     least = 1
     for column in table.columns:
-        breaks = column.overflow == "fold" and not column.no_wrap  # anywhere, but for its head and numbers
+        breaks = column.overflow == "fold" and not column.no_wrap  # texts may break anywhere, but not heads and numbers
         cells = (cell for cell in map(str, column.cells) if not breaks or cell[:1] in "-+.0123456789")
         texts = [str(column.header), *cells]
         pieces = [piece for text in texts for piece in (text.splitlines() if column.no_wrap else text.split())]
@@ -187,10 +187,10 @@ def _keep_whole(table: Table) -> int:
 
 
 def require_name(name: str) -> None:
-    """Refuse a name that no file of ours may have.
+    """Refuse a name that our files cannot hold.
 
     Raises:
-        InputError: saying so.
+        InputError: saying what a name may be.
     """
     from gmem_jax.files.validation import NAME, title
 
@@ -201,14 +201,14 @@ def require_name(name: str) -> None:
 def check_output(
     path: Path, suffix: str, *, inputs: tuple[Any, ...] = (), force: bool, option: str = "--output"
 ) -> Path:
-    """`path`, once it is sure that writing it can succeed and destroys nothing: a long run must not end in a refusal.
+    """Make sure that an output can be written and destroys nothing, before a long run; gives `path`.
 
     Args:
         path: the file to write.
-        suffix: that its name must have; "" for any.
-        inputs: files that the command reads, which are never written onto.
-        force: whether a file that is there may be replaced.
-        option: what to name in the refusal.
+        suffix: the suffix that its name must have; "" for any.
+        inputs: files that the command reads, which are never replaced.
+        force: whether a file that exists may be replaced.
+        option: the option to name in an error.
 
     Raises:
         InputError: saying what is wrong, and what would be right.
@@ -241,21 +241,21 @@ def check_output(
 
 
 def announce(what: str, grain_steps: float, memory: float, backend: str, replicas: int = 1) -> dict[str, float]:
-    """Say what a run will need before it begins, and refuse what cannot fit the free memory.
+    """Say what a run will need before it begins, and refuse one that does not fit into the free memory.
 
     Args:
-        what: the run.
+        what: a description of the run.
         grain_steps: grains times steps times replicas.
-        memory: in bytes.
-        backend: who does the steps.
-        replicas: side by side: several are cheaper than one.
+        memory: memory that it takes, in bytes.
+        backend: the backend that computes the steps.
+        replicas: number of replicas side by side; with several, a grain-step is cheaper than with one.
 
     Returns:
-        The same as numbers: grain_steps, seconds and memory_bytes.
+        The needs as numbers: grain_steps, seconds and memory_bytes.
 
     Raises:
-        InputError: saying what is needed and what there is.
-        ValueError: if GMEM_THREADS is no number of threads.
+        InputError: if the run takes too long or too much memory, saying what is needed and what there is.
+        ValueError: if GMEM_THREADS is not a number of threads.
     """
     import psutil
 
@@ -278,7 +278,7 @@ def announce(what: str, grain_steps: float, memory: float, backend: str, replica
 
 
 def emit_cost(as_json: bool, cost: dict[str, float], output: Path, disk_bytes: float) -> None:
-    """The result of a dry run: what `announce` returned, and what the output takes of the disk."""
+    """Print the result of a dry run: the numbers of `announce`, and the disk space of the output."""
     from gmem_jax.files.sizes import in_bytes
 
     line = f"disk: {in_bytes(disk_bytes)} for {output}; nothing was run or written"
@@ -286,14 +286,14 @@ def emit_cost(as_json: bool, cost: dict[str, float], output: Path, disk_bytes: f
 
 
 def draw_beside(picture: Path | None, figure: "Callable[[], Figure]") -> str:
-    """Draw a picture beside a result that is written already: what goes wrong is a warning, and nothing is lost.
+    """Draw a picture beside a result that is already written; an error becomes a warning, so that nothing is lost.
 
     Args:
-        picture: file to write; None where none is wanted.
-        figure: makes what it shows.
+        picture: file to write; None if no picture is wanted.
+        figure: makes the figure.
 
     Returns:
-        " and FILE", for the line that says what was written; "" if nothing was.
+        " and FILE", for the line that says what was written; "" if no picture was.
     """
     from gmem_jax.show.render_matplotlib import to_matplotlib
 
@@ -301,7 +301,7 @@ def draw_beside(picture: Path | None, figure: "Callable[[], Figure]") -> str:
         return ""
     try:
         to_matplotlib(figure()).save(picture)
-    except Exception as error:  # matplotlib's, by the user's fonts and settings
+    except Exception as error:  # from matplotlib, with the user's fonts and settings
         why = " ".join(str(error).split()) or type(error).__name__
         log(f"warning: {picture}: could not be drawn ({why})", style="yellow")
         return ""
@@ -310,10 +310,10 @@ def draw_beside(picture: Path | None, figure: "Callable[[], Figure]") -> str:
 
 @contextlib.contextmanager
 def reporting(*, goes_on: bool = False) -> "Iterator[Progress]":
-    """Progress of a run: a bar on a terminal; elsewhere a line for every stage, and one at least every 30 s.
+    """Show the progress of a run: a bar on a terminal; else a line for every stage, and one every 30 s at most.
 
     Args:
-        goes_on: whether the same command goes on where it was interrupted.
+        goes_on: whether the same command, called again, goes on from where it was interrupted.
     """
     try:
         with _reporting() as progress:

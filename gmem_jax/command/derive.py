@@ -51,19 +51,19 @@ from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache
 from gmem_jax.simulation.observers import CHUNK
 from gmem_jax.simulation.progress import within
 
-GRADIENT_COST = 5.5  # of a gradient through the prefix too, in runs (docs/speed.md)
-MANY = 16  # signals above which one kernel serves all rather than a Jacobian each
+GRADIENT_COST = 5.5  # cost of a gradient through the whole experiment, in runs (docs/speed.md)
+MANY = 16  # signals; with more, designs use one kernel instead of a Jacobian for each
 
 
 def _announce(experiment: Experiment, what: str, runs: float, side_by_side: int, memory: float = 1.0) -> None:
-    """Say what is needed.
+    """Say what a command will need; see `announce`.
 
     Args:
-        experiment: of one run.
-        what: is done.
-        runs: of the experiment's signals that it takes.
-        side_by_side: signals at once.
-        memory: in parts of what they take in a run.
+        experiment: the experiment of one run.
+        what: name of the command.
+        runs: number of runs of all signals of the experiment that it takes.
+        side_by_side: number of signals that run together.
+        memory: memory that it takes, over that of a run of these signals.
     """
     steps = steps_of_grains(experiment, experiment.signals.count)
     backend = experiment.runs_on
@@ -109,7 +109,7 @@ def gradient_command(
     waves, places = _waveform_of(experiment)
     law = experiment.friction
     names = {"waveform": waves, **{name: path for name, path in PARAMETERS.items() if _has(law, path)}}
-    # The way back needs the state at the beginning of every chunk.
+    # Reverse mode needs the state at the beginning of every chunk.
     chunks = experiment.protocol.bins / CHUNK
     _announce(experiment, "gradient", GRADIENT_COST, experiment.signals.count, 1.0 + chunks / COPIES)
     with resumable(output, key_of_run(experiment, by=list(names)), restart=restart) as parts:
@@ -138,10 +138,9 @@ def gradient_command(
 def _of_waveforms(
     experiment: Experiment, name: str, places: np.ndarray, slopes: np.ndarray
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Where in u each waveform can be changed, in order, and the derivatives there.
+    """The places in u where each waveform can be changed, in order, and the derivatives there.
 
-    Amplitudes of zero at the same place as another are padding, and the ends of samples are fixed: no waveform has
-    them.
+    Amplitudes that are zero are left out as padding, and so are the ends of samples, which are fixed.
     """
     rows = []
     for place, height, slope in zip(places, np.asarray(value_at(experiment, name)), slopes, strict=True):

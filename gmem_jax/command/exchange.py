@@ -78,7 +78,7 @@ def import_command(
     as_json: AsJson = False,
 ) -> None:
     """Make a pack of spheres or clumps of one shape, of any sizes."""
-    # Here, not above: scipy takes half a second to load, and no other command needs it.
+    # Imported here, since scipy takes half a second to load and no other command needs it.
     from gmem_jax.preparation.imported import import_pack
 
     require_name(name)

@@ -55,11 +55,11 @@ _OTHERS: _Options = {
 
 
 def _options(entries: Mapping[str, Field[Any]], **defaults: Any) -> _Options:
-    """Options of fields with `words`: those of numbers of an experiment, of laws and of materials.
+    """Options for fields that have `words` in their metadata: numbers of an experiment, of laws and of materials.
 
     Args:
         entries: the fields.
-        defaults: in the place of their own.
+        defaults: defaults by name, instead of those of the fields.
     """
     found = {}
     for name, entry in entries.items():
@@ -72,7 +72,7 @@ def _options(entries: Mapping[str, Field[Any]], **defaults: Any) -> _Options:
 
 
 class ExperimentOptions:
-    """What the options of a command chose; a pack makes an experiment of it."""
+    """The values of a command's options, which make an experiment on any pack."""
 
     def __init__(self, values: dict[str, Any]) -> None:
         self._values, self._inputs = values, [values["signals"]]
@@ -87,13 +87,13 @@ class ExperimentOptions:
             self._values["signals"] = written.signals
 
     def with_signals(self, name: str) -> "ExperimentOptions":
-        """The same, but for the signals."""
+        """The same options with other signals."""
         return ExperimentOptions({**self._values, "signals": name})
 
     def check_output(
         self, packs: Sequence[str], output: Path, suffix: str, *, picture: bool, force: bool
     ) -> tuple[list[Experiment], Path | None]:
-        """The experiments on some packs, once it is sure that the output and the picture beside it can be written.
+        """Make the experiments on some packs, and make sure that the output and the picture beside it can be written.
 
         Raises:
             ValueError: for impossible values, or an output that would destroy something.
@@ -107,10 +107,10 @@ class ExperimentOptions:
         return experiments, drawn
 
     def target(self, count: int) -> Signals | None:
-        """The waveforms that the `count` chosen ones were designed to be recalled as; None if they were not designed.
+        """The target of the design of the `count` chosen waveforms; None if they were not designed.
 
         Raises:
-            FileFormatError: if their file has another target.
+            FileFormatError: if the target in their file has another number of signals.
         """
         name = self._values["signals"]
         alone = not sets_named(name) and Path(name).suffix.lower() == ".csv"
@@ -139,18 +139,18 @@ class ExperimentOptions:
 
 def experiment_options() -> _Options:
     """All options of an experiment."""
-    of_law = _options(OF_LAW, **{**dict.fromkeys(OF_LAW), "mu": Hooke().mu})  # what is not given is the law's
+    of_law = _options(OF_LAW, **{**dict.fromkeys(OF_LAW), "mu": Hooke().mu})  # None: the law's own default
     of_material = _options(OF_MATERIAL, **dict.fromkeys(OF_MATERIAL))
     return {**_OTHERS, **of_law, **of_material, **_options(NUMBERS)}
 
 
 def with_experiment(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command all options of an experiment; it gets what they chose as `chosen`."""
+    """Give a command all options of an experiment; it gets their values as `chosen`, an `ExperimentOptions`."""
     return _with(command, "chosen", ExperimentOptions, experiment_options())
 
 
 def with_recipe(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command every number of a preparation as an option; it gets the `recipe` that they make."""
+    """Give a command every number of a preparation as an option; it gets them as `recipe`."""
     options = {entry.name: (entry.default, entry.type, words_of(entry), ()) for entry in fields(Recipe)}
     return _with(command, "recipe", lambda values: Recipe(**values), options)
 
@@ -158,7 +158,7 @@ def with_recipe(command: Callable[..., None]) -> Callable[..., None]:
 def _with(
     command: Callable[..., None], name: str, make: Callable[[dict[str, Any]], Any], options: _Options
 ) -> Callable[..., None]:
-    """A command with more options (default, type, help, flags); it gets what `make` makes of their values as `name`."""
+    """A command with further options; it gets the result of `make`, called with their values, as argument `name`."""
     signature = inspect.signature(command)
     own = [entry for entry in signature.parameters.values() if entry.name != name]
     added = [

@@ -41,15 +41,15 @@ from gmem_jax.show import tables
 from gmem_jax.simulation.frames import Frames
 from gmem_jax.simulation.sample import Sample
 
-PREPARATION_BYTES = 2e4  # of memory a grain: lists while grains fly, at N = 10,240
+PREPARATION_BYTES = 2e4  # memory of a preparation per grain, for lists while grains fly, at N = 10,240
 CLUMP_OVERLAP = 0.6
 
 
 def standard_recipe(name: str) -> Recipe:
-    """The recipe of a pack that is made by its name.
+    """The recipe of a standard pack, from its name.
 
     Raises:
-        InputError: if it is no such name.
+        InputError: if it is not the name of a standard pack, or that pack is shipped.
     """
     if not (found := STANDARD_NAME.fullmatch(name)):
         raise InputError(
@@ -64,7 +64,7 @@ def grain_of(shape: str, overlap: float | None) -> Clump:
     """The grain that `--shape` and `--overlap` ask for.
 
     Raises:
-        ValueError: if they ask for none.
+        ValueError: if they do not describe a grain.
         FileNotFoundError: if there is no such file.
     """
     if shape == "tetra":
@@ -123,12 +123,12 @@ def prepare_command(
     elif output is None:
         raise InputError("--output is missing: name a file, or a standard pack like tetra-31680-a")
     require_name(name)
-    preparation_frames(recipe, frames)  # refuses what cannot be before anything is begun
+    preparation_frames(recipe, frames)  # refuses an impossible number before anything is begun
     check_output(output, ".h5", force=force)
     made = graded(recipe, clump)
     backend = backend_name(backend, Frictionless())
     cost = announce(f"{recipe.grains} grains", grain_steps(recipe, made), PREPARATION_BYTES * recipe.grains, backend)
-    # Patience is not in the key: with more of it a pack that did not come to rest goes on.
+    # Patience is not in the key: a pack that did not come to rest can go on with more of it.
     told = {name: value for name, value in asdict(recipe).items() if name != "patience"}
     key = {"recipe": told, "grain": fingerprint(clump), "backend": backend, "frames": frames, **sources()}
     if dry_run:

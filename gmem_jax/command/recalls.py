@@ -45,12 +45,12 @@ from gmem_jax.physics.state import combined_status
 from gmem_jax.show import tables
 from gmem_jax.show.summaries import Summary, of_recall
 
-TYPICAL = "tetra-325-e"  # of the five shipped packs of 325 that with the median F
+TYPICAL = "tetra-325-e"  # the pack with the median F among the five shipped packs of 325 grains
 SHIPPED: dict[str, Any] = {
     "packs": 5,
     "gain": (0.225, 0.040),
     "fidelity": (0.803, 0.096),
-}  # mean and SD of those, as `demo` runs them
+}  # mean and SD over these five packs, as `demo` runs them
 
 
 def _announce(experiment: Experiment, batch: int) -> dict[str, float]:
@@ -75,7 +75,7 @@ def _run(
     frames_of: int = 1,
     frames_at: Sequence[float] = (),
 ) -> Summary:
-    """Run one recall with a progress bar and write it; its summary."""
+    """Run one recall with a progress bar and write it; gives its summary."""
     batch = batch_for(experiment, data, batch, restart=restart)
     _announce(experiment, batch)
     film: Any = {"frames": frames, "frames_of": frames_of, "frames_at": list(frames_at)}
@@ -130,7 +130,7 @@ def recall_command(
     at = _compressions(frames_at)
     if not frames and not at:
         refuse_idle("without --frames or --frames-at, which say how many", "frames_of")
-    require_stable(experiment)  # what cannot be is refused before anything is begun
+    require_stable(experiment)  # impossible options are refused before anything is begun
     frame_schedule(experiment, frames, frames_of, at)
     film: Any = {"frames": frames, "frames_of": frames_of, "frames_at": at}
     if dry_run:
@@ -146,7 +146,7 @@ def recall_command(
 
 
 def _compressions(text: str) -> list[float]:
-    """Numbers of --frames-at."""
+    """The compressions in --frames-at."""
     try:
         return [float(each) for each in text.split(",")] if text else []
     except ValueError:

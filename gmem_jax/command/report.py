@@ -23,7 +23,7 @@ def report_command(
     """One page of all that files hold, to be looked at in a browser: figures, tables and the pack in 3D; no network."""
     check_output(output, ".html", inputs=tuple(files), force=force)
     began = time.perf_counter()
-    script()  # refuses at once where there is no plotly
+    script()  # fails at once if plotly is not installed
     report = Report()
     for file in files:
         report.add(file)

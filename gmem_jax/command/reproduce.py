@@ -66,7 +66,7 @@ def reproduce_command(
         require_options(executor, options)
         _say_cost(what, scale, output, workers or 1, as_json)
         return
-    executor_named(executor, workers, options)  # what cannot be had is refused before anything is written
+    executor_named(executor, workers, options)  # refuses an impossible executor before anything is written
     check_folder(output)
     output.mkdir(exist_ok=True)
     outcomes, verdicts, weighed, drawn = [], [], Weighed([], [], []), []
@@ -122,7 +122,7 @@ def reproduce_command(
 
 
 def _say_cost(what: str, scale: str, output: Path, workers: int, as_json: bool) -> None:
-    """What is not there of the points that are needed, and how long nets are trained at most."""
+    """Print the cost of the missing points, and the longest training of nets."""
     size, names = scale_of(scale), [name for name in (*FIGURES, GALLERY, "claims", "choices") if what in (name, "all")]
     names = list(COLLECTED) if what == "dataset" else names
     facts, lines = {}, ["seconds: no experiment is run"]
@@ -136,7 +136,7 @@ def _say_cost(what: str, scale: str, output: Path, workers: int, as_json: bool) 
 
 @contextlib.contextmanager
 def _going_on(broken: list[str]) -> Iterator[None]:
-    """What cannot be shown because a run failed is said, and the next thing done."""
+    """Report a run that fails in the block, and go on."""
     try:
         yield
     except RunFailedError as error:
@@ -145,7 +145,7 @@ def _going_on(broken: list[str]) -> Iterator[None]:
 
 
 def _options(texts: Sequence[str]) -> dict[str, Any]:
-    """Options of an executor by name; numbers where they read as such.
+    """Options of an executor by name; values that look like numbers become numbers.
 
     Raises:
         InputError: if one does not read like timeout_min=240.
@@ -172,7 +172,7 @@ def _say_written(done: Outcome | Weighed) -> None:
 
 
 def _choices_table(effects: Sequence[Effect]) -> Table:
-    """How much each choice matters; the default of each is in bold."""
+    """A table of the effects of choices; the default of each is in bold."""
     table = Table(title="What the paper leaves open", caption="mean ± SE over packs; changes on the same packs")
     for name in ("choice", "value", "G", "F", "change of G", "change of F"):
         table.add_column(name, justify="left" if name == "choice" else "right")
@@ -185,7 +185,7 @@ def _choices_table(effects: Sequence[Effect]) -> Table:
 
 
 def _table(outcome: Outcome) -> Table:
-    """Ours beside the published, where conditions vary."""
+    """A table of our measures beside the published ones, with the conditions that vary."""
     table = Table(title=outcome.name, caption="mean ± SE; difference in combined standard errors, for the same N")
     fields = [name for name in (outcome.rows[0].conditions.__dict__ if outcome.rows else ())]
     varied = [name for name in fields if len({getattr(row.conditions, name) for row in outcome.rows}) > 1]

@@ -21,19 +21,19 @@ Restart = Annotated[bool, typer.Option("--restart", help="Discard what an interr
 
 
 def folder_of(output: Path) -> Path:
-    """Where the parts of an unfinished run are kept."""
+    """The folder of the parts of an unfinished run."""
     return output.with_name(f"{output.name}.parts")
 
 
 def batch_for(experiment: Experiment, output: Path, wanted: int | None = None, *, restart: bool = False) -> int:
-    """Signals to run together: as wanted, as in the parts of an unfinished run, or what fits the free memory."""
+    """Number of signals to run together: as wanted, else as in an unfinished run, else as fits into the free memory."""
     kept = None if restart else Checkpoints.key_of(folder_of(output)).get("batch")
     known = wanted or (kept if isinstance(kept, int) and kept > 0 else None)
     return known or default_batch(experiment, psutil.virtual_memory().available)
 
 
 def foresee(output: Path, key: dict[str, Any], *, restart: bool) -> None:
-    """Say in a dry run what the parts beside an output would mean; arguments are those of `resumable`."""
+    """Say in a dry run how the real run would use the parts beside an output; arguments are those of `resumable`."""
     parts = folder_of(output)
     if not Checkpoints.key_of(parts):
         return
@@ -45,7 +45,7 @@ def foresee(output: Path, key: dict[str, Any], *, restart: bool) -> None:
 
 
 def check_folder(path: Path) -> None:
-    """Refuse an `--output` that is a folder where none can be made or written.
+    """Refuse an `--output` if no folder can be made or written there.
 
     Raises:
         InputError: saying what is wrong.
@@ -56,7 +56,7 @@ def check_folder(path: Path) -> None:
         raise InputError(f"--output {path}: is a file, and a folder is needed; name another")
     try:
         with suppress(FileNotFoundError):
-            lock_of(path).lstat()  # whose name is longer
+            lock_of(path).lstat()  # fails if the name of the lock, which is longer, is too long
         probe(path / "probe" if path.is_dir() else path)
     except OSError as error:
         raise InputError(f"--output {path}: cannot write there ({error.strerror})") from error
@@ -64,12 +64,12 @@ def check_folder(path: Path) -> None:
 
 @contextmanager
 def resumable(output: Path, key: dict[str, Any], *, restart: bool) -> Iterator[Checkpoints]:
-    """The parts of a run into `output`, there as long as it is not written: discarded if the block succeeds.
+    """The parts of a run that writes `output` in the block; they are discarded if the block succeeds.
 
     Args:
         output: the file to be written within the block.
-        key: what the numbers depend on.
-        restart: discard what is there.
+        key: everything that the numbers depend on.
+        restart: whether to discard parts that are there.
 
     Raises:
         FileFormatError: if there are parts of another run, or another process writes the output now.

@@ -91,7 +91,7 @@ def show(
 
 
 def _numbers(text: str) -> list[int]:
-    """Numbers of --signal."""
+    """The numbers in --signal."""
     try:
         return [int(each) for each in text.split(",")] if text else []
     except ValueError:
@@ -117,7 +117,7 @@ def _draw(file: Path, pictures: dict[str, Draw], plot: str, output: Path | None,
 
 
 def _words(picture: str) -> str:
-    """What a picture shows, in words."""
+    """The description of a picture."""
     what, *part = picture.split("/")
     return ": ".join(filter(None, (PLOTS.get(what, SEEN), ", ".join(part))))
 

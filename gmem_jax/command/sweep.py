@@ -125,20 +125,20 @@ def sweep_command(
 
 
 def planned(path: Path, spec: Spec, folder: Path) -> SweepRunner:
-    """The sweep of a file, once it is sure that its points can be.
+    """The sweep of a file, after a check that its points are possible.
 
     Raises:
-        FileFormatError: if one cannot, or the folder holds something else.
+        FileFormatError: if one is not, or the folder holds something else.
     """
     with _of_file(path):
         runner = SweepRunner(spec, folder, log)
-        runner.check()  # leaves nothing behind where it refuses
+        runner.check()  # writes nothing if it refuses
     return runner
 
 
 @contextlib.contextmanager
 def _of_file(path: Path) -> Iterator[None]:
-    """Problems of what a sweep file asks for are told as the file's."""
+    """Turn errors of the values in a sweep file into errors of the file."""
     try:
         yield
     except (ValueError, TypeError, FileNotFoundError) as error:
@@ -180,7 +180,7 @@ def split_names(text: str) -> list[str]:
 
 
 def _stop(store: Store, as_json: bool) -> None:
-    """End whoever works on a sweep; what is computed stays."""
+    """End all processes and jobs of a sweep; finished points stay."""
     ended, left = stop(store)
     for line in left:
         log(line, style="yellow")
