@@ -21,8 +21,8 @@ from gmem_jax.physics.contact.frictionless import Frictionless
 
 PACKS = ("tetra-325-a", "tetra-1024-a", "tetra-10240-b")
 REPLICAS = (1, 8, 32, 128)
-BINS_TIMED = 32  # of a call, as in a run: what the host does around a call would weigh more in a shorter one
-OTHERS = (  # packs, laws, backends and replicas beside law H on all of `PACKS`
+BINS_TIMED = 32  # bins in a timed call, as in a run; in shorter calls the work of the host would weigh more
+OTHERS = (  # further cases: pack, law, backend and replicas
     ("tetra-1024-a", "M1", "native", 128),
     ("tetra-10240-b", "M1", "native", 128),
     ("tetra-1024-a", "M2", "native", 32),
@@ -30,7 +30,7 @@ OTHERS = (  # packs, laws, backends and replicas beside law H on all of `PACKS`
     ("tetra-1024-a", "H", "jax", 8),
     ("tetra-10240-b", "H", "jax", 8),
 )
-COPIED = 1 << 26  # numbers, for the bandwidth
+COPIED = 1 << 26  # numbers that are copied to measure the bandwidth
 ARCHITECTURES = {"sm_80": "A100", "sm_90": "H100, H200", "sm_100": "B200", "sm_120": "RTX 50"}
 GPU_LAWS = {"frictionless": Frictionless(), **measure.TIMED_LAWS}
 
@@ -52,7 +52,7 @@ def device() -> Any:
 
 
 def copied_bytes_per_second() -> float:
-    """What the device reads and writes in a second at best: the median of ten copies of `COPIED` numbers."""
+    """Bytes that the device reads and writes per second: the median over ten copies of `COPIED` numbers."""
     copy, numbers = jax.jit(lambda numbers: numbers + 1.0), jnp.zeros(COPIED)
     jax.block_until_ready(copy(numbers))
     taken = []
@@ -64,12 +64,12 @@ def copied_bytes_per_second() -> float:
 
 
 def bytes_per_grain_step(pack: Pack) -> dict[str, float]:
-    """Bytes of a grain-step under law H, many replicas: what must come from memory or go there, and what is gathered.
+    """Bytes of a grain-step under law H with many replicas.
 
     Returns:
-        "memory": what either kernel reads or writes, each number once. "gathered": what it reads again, for the other
-        candidates of a sphere and contacts of a grain; caches may hold it. "held": memory of a grain and replica,
-        between steps and in the arrays of a call.
+        "memory": bytes that both kernels read and write, each number counted once. "gathered": bytes that they read
+        again, for the other candidates of a sphere and contacts of a grain; caches may hold these. "held": memory per
+        grain and replica, between steps and in the arrays of a call.
     """
     simulation, state = measure.encode(pack, measure.TIMED_LAWS["H"], 1, "native")
     touching = float(take_census(simulation.system, state, pack.box).sphere_contacts[0]) / pack.grains
@@ -83,7 +83,7 @@ def bytes_per_grain_step(pack: Pack) -> dict[str, float]:
 
 
 def registers() -> dict[str, dict[str, tuple[Needs, Needs]]]:
-    """What the kernels `touch` and `move_alone` take, by law and architecture; empty without NVRTC or library."""
+    """Needs of the kernels `touch` and `move_alone` by law and architecture; empty without NVRTC or native library."""
     if cuda.missing() or not library.available()[0]:
         return {}
 
@@ -96,10 +96,10 @@ def registers() -> dict[str, dict[str, tuple[Needs, Needs]]]:
 
 
 def timed(load: Callable[[str], Pack], say: measure.Say = lambda what, fraction: None) -> dict[str, Any]:
-    """Every pack and number of replicas under law H, `OTHERS`, and the bandwidth of a copy.
+    """Times of every pack and number of replicas under law H, and of `OTHERS`; and the bandwidth of a copy.
 
     Raises:
-        ValueError: see `device`.
+        ValueError: as in `device`.
     """
     on = device()
     with jax.default_device(on):
@@ -114,7 +114,7 @@ def timed(load: Callable[[str], Pack], say: measure.Say = lambda what, fraction:
 
 
 def kernel_facts(load: Callable[[str], Pack]) -> dict[str, Any]:
-    """What is known without a GPU."""
+    """Registers and bytes of the kernels, which are known without a GPU."""
     return {
         **provenance(),
         "registers": registers(),
@@ -123,7 +123,7 @@ def kernel_facts(load: Callable[[str], Pack]) -> dict[str, Any]:
 
 
 def gpu_markdown(facts: dict[str, Any], times: dict[str, Any] | None) -> str:
-    """Tables of `kernel_facts` and, where there was a GPU, of `timed`."""
+    """Tables of `kernel_facts` and, if there was a GPU, of `timed`."""
     heads = [f"{architecture} ({name})" for architecture, name in ARCHITECTURES.items()]
     lines = ["Registers of a thread and bytes that it spills, in `touch` and in `move_alone` (`--fmad=false`):", ""]
     lines += ["| law | " + " | ".join(heads) + " |", "|---" * (1 + len(heads)) + "|"]

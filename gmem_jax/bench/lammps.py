@@ -38,7 +38,7 @@ def _program() -> Path:
 
 
 def _environment() -> dict[str, str]:
-    """The wheel of MPICH puts its library where the loader does not look."""
+    """The environment of LAMMPS, with the path of MPICH's library: its wheel puts it where the loader does not look."""
     libraries = [str(Path(sys.prefix) / "lib"), os.environ.get("LD_LIBRARY_PATH", "")]
     return {**os.environ, "LD_LIBRARY_PATH": ":".join(filter(None, libraries)), "OMP_NUM_THREADS": "1"}
 
@@ -56,14 +56,14 @@ def missing_lammps() -> str | None:
 
 
 def version() -> str:
-    """Its date, as in "22 Jul 2025 - Update 4"; "" if it says none."""
+    """The version of LAMMPS, a date like "22 Jul 2025 - Update 4"; "" if it is not printed."""
     told = subprocess.run([_program(), "-h"], env=_environment(), capture_output=True, text=True, timeout=60).stdout
     found = re.search(r"Parallel Simulator - (.+)", told)
     return found[1].strip() if found else ""
 
 
 def execute(script: Sequence[str], folder: Path, ranks: int = 1) -> str:
-    """Run the lines of `script` in `folder`; the screen output.
+    """Run the lines of `script` in `folder`; gives the screen output.
 
     Raises:
         RuntimeError: if LAMMPS fails, with the end of its output.
@@ -84,15 +84,15 @@ class Scene:
 
     Attributes:
         clump: the grain.
-        position: [N, 3].
-        quaternion: [N, 4].
-        velocity: [N, 3].
-        spin: [N, 3].
-        lower: planes, [3]; -inf for none.
-        upper: planes, [3]; inf for none.
-        lower_velocity: [3].
-        upper_velocity: [3].
-        periodic: axes along which the planes are none: the box is periodic there, and grows with them.
+        position: centres of mass, [N, 3].
+        quaternion: body-to-lab rotations, [N, 4].
+        velocity: velocities, [N, 3].
+        spin: angular velocities, [N, 3].
+        lower: lower planes, [3]; -inf for none.
+        upper: upper planes, [3]; inf for none.
+        lower_velocity: velocities of the lower planes, [3].
+        upper_velocity: velocities of the upper planes, [3].
+        periodic: periodic axes; there the planes are not walls, but the ends of the box.
     """
 
     clump: Clump
@@ -122,7 +122,7 @@ class Scene:
 
     @property
     def spheres(self) -> np.ndarray:
-        """Sphere centres, [N, K, 3]."""
+        """Centres of the spheres, [N, K, 3]."""
         sizes = np.ones(1) if self.clump.sizes is None else np.asarray(self.clump.sizes)
         arms = sizes[:, None, None] * np.einsum("nij,kj->nki", self.rotations, np.asarray(self.clump.offsets))
         centres: np.ndarray = self.position[:, None] + arms
@@ -138,13 +138,13 @@ def _row(*values: float) -> str:
 
 
 def write_scene(scene: Scene, folder: Path, *, skin: float = 0.2, every: int = 1) -> list[str]:
-    """Write `scene.data` (and `scene.bodies` for clumps) to `folder`; the script lines that read them.
+    """Write `scene.data` (and `scene.bodies` for clumps) to `folder`; gives the script lines that read them.
 
     Args:
         scene: the grains.
         folder: an existing folder.
-        skin: of LAMMPS' neighbour list, in R.
-        every: steps between its checks of that list.
+        skin: skin of LAMMPS' neighbour list, in R.
+        every: steps between LAMMPS' checks of that list.
     """
     spheres = scene.spheres
     count, per_grain = spheres.shape[:2]
@@ -206,7 +206,7 @@ def masses_of_types(clump: Clump) -> list[float]:
 def _tangential(
     friction: Frictionless | Hooke | MindlinRescaled | None, normal_damping: Scalar, root_radius: float = 1.0
 ) -> str:
-    """LAMMPS' words for a law whose normal contacts have this damping, and the root of this effective radius."""
+    """LAMMPS' tangential law, for normal contacts with this damping and this root of the effective radius."""
     if isinstance(friction, Hooke):
         if friction.damping_time != 0.0:
             raise ValueError("LAMMPS has no law with Hooke's dashpot; use damping_time=0")
@@ -222,7 +222,7 @@ def _tangential(
 def pair_lines(
     friction: Frictionless | Hooke | MindlinRescaled, material: Material, masses: Sequence[float]
 ) -> list[str]:
-    """Sphere-sphere contacts of grains of some masses, one for each atom type.
+    """Script lines for sphere-sphere contacts of grains, whose masses are given for each atom type.
 
     Hooke's constant dashpot has no counterpart (LAMMPS' varies with the contact radius): its damping_time must be 0.
     """
@@ -245,10 +245,11 @@ def wall_lines(
     dt: float,
     friction: Hooke | MindlinRescaled | None = None,
 ) -> list[str]:
-    """The finite planes of the scene; computes `c_wall0` (-x), `c_wall1` (+x), ... are the forces on grains.
+    """Script lines for the finite planes of the scene; computes `c_wall0` (-x), `c_wall1` (+x), ... are wall forces.
 
-    The damping is that of grains of size 1. `friction` is the law with the coefficient of the walls, if they have one.
-    LAMMPS' effective radius at a wall is R in the place of R / 2; what else makes Mindlin's springs stiffer is given.
+    The damping is that of grains of size 1. `friction` is the law with the friction coefficient of the walls, if they
+    have one. LAMMPS' effective radius at a wall is R instead of R / 2. The rest of the factor by which Mindlin's
+    springs are stiffer at walls is given as stiffness.
     """
     if isinstance(friction, MindlinRescaled):
         friction = replace(friction, stiffness=friction.stiffness * material.wall_stiffness / material.normal_stiffness)
@@ -293,9 +294,9 @@ def scene_script(
     gravity: Scalar | None = None,
     wall_mu: float | None = None,
 ) -> list[str]:
-    """Everything up to `run`: files written to `folder`, contacts, walls and integrator; see `write_scene`.
+    """Script lines up to `run`, with contacts, walls and integrator; files go to `folder`, as in `write_scene`.
 
-    `gravity` is its acceleration along -z, in R / t_c^2, `wall_mu` the friction coefficient of walls; None for none.
+    `gravity` is the acceleration along -z, in R / t_c^2; `wall_mu` is the friction coefficient of walls; None for none.
     """
     script = write_scene(scene, folder, skin=skin, every=every)
     script += pair_lines(friction, material, masses_of_types(scene.clump))
@@ -309,7 +310,7 @@ def scene_script(
         strains = (f"{'xyz'[axis]} erate {_number(growth[axis])}" for axis in np.flatnonzero(scene.periodic))
         script.append(f"fix cell all deform 1 {' '.join(strains)} remap v")
     if gravity is not None:
-        # Bodies of overlapping spheres are heavier by that than they are: the integrator adds their own weight.
+        # The spheres of a clump together weigh more than the clump: the integrator adds its own weight instead.
         whose = "all" if scene.clump.spheres == 1 else "nobody"
         script += ["group nobody empty", f"fix weight {whose} gravity {_number(gravity)} vector 0 0 -1"]
     if scene.clump.spheres > 1:
@@ -322,14 +323,14 @@ def scene_script(
 
 @dataclass(frozen=True)
 class Trajectory:
-    """What a run left; T frames, the first at step 0.
+    """The T frames of a run, the first at step 0.
 
     Attributes:
-        position: grain centres, [T, N, 3] (the mean of their spheres).
-        velocity: of the grain centres, [T, N, 3].
-        spin: [T, N, 3].
-        force: on the spheres from other spheres and walls, [T, N K, 3].
-        walls: force on the grains by each finite plane along its axis, [T, F].
+        position: grain centres (means over their spheres), [T, N, 3].
+        velocity: velocities of the grain centres, [T, N, 3].
+        spin: angular velocities, [T, N, 3].
+        force: forces on the spheres from other spheres and walls, [T, N K, 3].
+        walls: force on the grains by each of the F finite planes, along its axis, [T, F].
     """
 
     position: np.ndarray
@@ -340,7 +341,7 @@ class Trajectory:
 
 
 def run_lammps(script: list[str], folder: Path, *, steps: int, every: int, per_grain: int) -> Trajectory:
-    """Run a prepared script and read what it wrote every `every` steps."""
+    """Run a prepared script and read its frames, one every `every` steps."""
     walls = re.findall(r"^compute (wall\d)", "\n".join(script), flags=re.MULTILINE)
     script = [
         *script,

@@ -49,14 +49,14 @@ from gmem_jax.simulation.stage import Drive, Stage
 from gmem_jax.sweeps.executors import cores
 
 TIMED_LAWS = {entry.paper: entry.kind() for entry in laws.LAWS if entry.kind is not Frictionless}
-T0 = 1.8e3  # duration of the compression that is timed, t_c, if not chosen
+T0 = 1.8e3  # t_c, default duration of the compression that is timed
 ENCODE = Stage("encode", 0.0, 1.0, 1.0, "write", (Drive("xy", "xy"),))
-BINS_PER_CALL = 8  # bins per timed call, so that checks and samples weigh as in a run; which does 32 at once
-PRESSURE = 2e-3  # E, of packs
-AGREEMENT = 1e-8  # of the pressure, between backends: round-off grown over a few hundred steps
+BINS_PER_CALL = 8  # bins per timed call, so that checks and samples weigh as in a run, which does 32 at once
+PRESSURE = 2e-3  # E, pressure of packs
+AGREEMENT = 1e-8  # largest difference between backends over the pressure: round-off grows in a few hundred steps
 LAMMPS_LISTS = ((0.1, 20), (0.2, 50), (0.2, 1000), (0.3, 1000))  # (skin in R, steps between checks) tried for LAMMPS
 Say = Callable[[str, float], None]
-"""Called with what is being measured and the fraction done."""
+"""Called with the name of the present measurement and the fraction done."""
 
 
 def processor() -> str:
@@ -68,7 +68,7 @@ def processor() -> str:
 
 
 def encode(pack: Pack, law: FrictionLaw, replicas: int, backend: str, t0: float = T0) -> tuple[Simulation, State]:
-    """The start of an encode stage: what a rollout needs."""
+    """Simulation and state at the start of an encode stage, for a rollout."""
     heights = jnp.linspace(-1.0, 1.0, max(1, replicas - 1))[:, None]
     signals = Bumps(heights, jnp.full_like(heights, 0.1), 0.2)
     experiment = Experiment(pack, signals, law, t0=t0, backend=backend_name(backend, law))
@@ -86,7 +86,7 @@ def rival(
     seconds: float = 0.5,
     bins: int = BINS_PER_CALL,
 ) -> Candidate:
-    """A rollout of some bins on a backend, compiled; timed for about `seconds` each time.
+    """A compiled rollout of some bins on a backend, to be timed for about `seconds` each time.
 
     Raises:
         RuntimeError: if the simulation breaks down.
@@ -125,7 +125,7 @@ def lammps_rivals(pack: Pack, law: str, *, steps: int = 1000) -> list[Candidate]
     Its neighbour settings are tuned first. Law H has no dashpot there (see `lammps.pair_lines`).
 
     Raises:
-        ValueError: for law M2, which it does not have.
+        ValueError: for law M2, which LAMMPS does not have.
     """
     friction = TIMED_LAWS[law]
     if isinstance(friction, Mindlin):
@@ -165,15 +165,15 @@ def lammps_rivals(pack: Pack, law: str, *, steps: int = 1000) -> list[Candidate]
 def tile(pack: Pack, times: tuple[int, int, int]) -> Pack:
     """Copies of a pack of spheres or tetra grains side by side in one box, each the mirror image of its neighbours.
 
-    A rigid frictionless wall is a mirror plane, so the copies are at rest without it: a larger pack with the same
-    contacts, which shows what size alone costs.
+    A rigid frictionless wall is a mirror plane, so that the copies are at rest without walls between them. The larger
+    pack has the same contacts, and shows the cost of size alone.
     """
     from scipy.spatial.transform import Rotation  # here: it takes half a second to load
 
     lengths = np.asarray(pack.upper - pack.lower)
     offsets = np.asarray(pack.clump.offsets)
     across = offsets[0] - offsets[-1] if len(offsets) > 1 else np.array([1.0, 0.0, 0.0])
-    # A reflection that takes the grain to itself makes a rotation of every mirror image.
+    # A reflection that maps the grain onto itself, with which a mirror image becomes a rotation.
     swap = np.eye(3) - 2.0 * np.outer(across, across) / (across @ across)
     position = np.asarray(pack.position) - np.asarray(pack.lower)
     turned = np.asarray(matrix(pack.quaternion[..., None]))[..., 0]
@@ -209,7 +209,7 @@ def _peak_memory(load: Callable[[str], Pack], name: str, backend: str, law: str,
 def _peak_bytes() -> int:
     """Peak resident bytes of this process."""
     status = Path("/proc/self/status")
-    if status.is_file():  # Linux lets ru_maxrss of a child begin with its parent's
+    if status.is_file():  # on Linux ru_maxrss of a child begins with its parent's
         return next(
             1024 * int(line.split()[1])
             for line in status.read_text(encoding="utf-8").splitlines()
@@ -220,9 +220,9 @@ def _peak_bytes() -> int:
 
 
 def memory(load: Callable[[str], Pack], name: str, grains: int, backend: str, law: str) -> float:
-    """Bytes per grain and replica: growth of the peak from some replicas to twice as many, each in its own process.
+    """Bytes per grain and replica: growth of peak memory from some replicas to twice as many, each in its own process.
 
-    There are so many of them that what they need, some 2 kB each, stands out from what else a process takes.
+    There are so many replicas that their memory, some 2 kB per grain, stands out from other memory of the process.
     """
     replicas = max(16, -(-65_536 // grains))
     peaks = []
@@ -254,18 +254,18 @@ def _gradient(load: Callable[[str], Pack], name: str, backend: str, values: int,
 def gradient_cost(
     load: Callable[[str], Pack], name: str, backend: str, *, values: int = 32, t0: float = T0
 ) -> dict[str, float]:
-    """Seconds and peak memory of the gradient of F by `values` numbers of each of the six waveforms, whole experiment.
+    """Seconds and peak memory of the gradient of F, through the whole experiment, by `values` numbers of six waveforms.
 
     Returns:
         "forward_s" of one run of the same replicas, "gradient_s", and the peak resident bytes of the process after
-        each; the process is a fresh one.
+        each. They are measured in a fresh process.
     """
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         return pool.submit(_gradient, load, name, backend, values, t0).result()
 
 
 def disagreements(rows: Sequence[Row]) -> list[str]:
-    """Cases in which native and plain JAX did not end at the same p_xy, relative to the usual pressure."""
+    """The cases in which native and plain JAX differ in their last p_xy by more than `AGREEMENT`, as lines of text."""
     cases: dict[tuple[str, int, int], dict[str, float]] = {}
     for row in rows:
         if row.engine != "lammps":
@@ -291,19 +291,19 @@ def run_benchmark(
     keep: Callable[[dict[str, Any]], None] = lambda result: None,
     say: Say = lambda what, fraction: None,
 ) -> dict[str, Any]:
-    """The whole table.
+    """Measure the whole table.
 
     Args:
         load: gives a pack by its name.
-        packs: their names; the first is also tiled to larger ones, and carries the plain-JAX comparison of M1 and M2.
+        packs: names of packs; the first is also tiled to larger packs, and used to compare M1 and M2 in plain JAX.
         laws: friction laws.
         replicas: numbers of replicas.
         t0: duration of the compression whose first bins are timed, in t_c; the cost against N is for `T0`.
         with_lammps: measure LAMMPS too, if it can run here.
-        with_jax: measure plain JAX too, where the native backend is there.
+        with_jax: measure plain JAX too, if the native backend is there.
         scaling: measure also the cost against N, memory and the cost of a gradient.
         sizes: copies of the first pack along each axis, for the cost against N.
-        keep: is given what has been measured so far, after every race.
+        keep: called with the results so far, after every race.
         say: see `Say`.
 
     Returns:
@@ -339,12 +339,12 @@ def run_benchmark(
         say(f"{law}, N = {pack.grains}", (0.7 if scaling else 1.0) * place / len(cases))
         counts = [count for count in replicas if fits(pack, law, count)]
         ours = [(backend, count) for backend in backends if _worth(pack, first, backend, law) for count in counts]
-        if law == "M2":  # its histories are large, and it has no rival
+        if law == "M2":  # one at a time: its histories are large, and LAMMPS does not have it
             found = [row for backend, count in ours for row in interleave([rival(pack, backend, law, count, t0=t0)])]
         else:
             theirs = lammps_rivals(pack, law) if absent is None else []
             found = interleave([*(rival(pack, backend, law, count, t0=t0) for backend, count in ours), *theirs])
-        wrong += disagreements(found)  # of this pack: another one of as many grains has another p_xy
+        wrong += disagreements(found)  # pack by pack, since p_xy differs between packs of one size
         add("rows", found)
     if wrong:
         raise RuntimeError("backends disagree: " + "; ".join(wrong))
@@ -376,5 +376,5 @@ def fits(pack: Pack, law: str, replicas: int) -> bool:
 
 
 def _worth(pack: Pack, first: Pack, backend: str, law: str) -> bool:
-    """Plain JAX is timed in full only where a user would wait for it."""
+    """Whether a case is timed: plain JAX only under law H or on the first pack, since other cases take too long."""
     return backend != "jax" or law == "H" or pack is first

@@ -1,4 +1,4 @@
-"""Timing several programs in turn, so that other load of the machine falls on all of them alike."""
+"""Timing several programs in turn, so that other load of the machine affects all of them alike."""
 
 import statistics
 from collections.abc import Callable, Sequence
@@ -16,13 +16,13 @@ class Row:
         engine: "native", "jax" or "lammps".
         law: "H", "M1" or "M2".
         grains: number of grains.
-        replicas: replicas side by side, for LAMMPS processes side by side.
-        us: best wall time of a grain-step, in microseconds.
-        median: of the repeats.
-        worst: of the repeats.
-        compile_s: seconds spent compiling, apart.
-        note: how LAMMPS was run, or what else is special.
-        p_xy: of the last replica at the end, in E; NaN where it cannot be compared.
+        replicas: number of replicas side by side; for LAMMPS, of processes.
+        us: best wall time of a grain-step over the repeats, in microseconds.
+        median: median over the repeats.
+        worst: longest time over the repeats.
+        compile_s: seconds of compilation, which are not part of the times.
+        note: how LAMMPS was run, or another remark.
+        p_xy: p_xy of the last replica at the end, in E; NaN if it cannot be compared.
     """
 
     engine: str
@@ -38,11 +38,11 @@ class Row:
 
 
 class Candidate(NamedTuple):
-    """Something to be timed.
+    """A program to be timed.
 
     Attributes:
-        row: what it is.
-        once: times it; microseconds a grain-step.
+        row: its description.
+        once: times the program; gives microseconds per grain-step.
     """
 
     row: Row
@@ -50,7 +50,7 @@ class Candidate(NamedTuple):
 
 
 def interleave(rivals: Sequence[Candidate], repeats: int = REPEATS) -> list[Row]:
-    """Time each of them `repeats` times, all in turn; the rows with their times."""
+    """Time each program `repeats` times, all in turn; gives the rows with their times."""
     times: list[list[float]] = [[] for _ in rivals]
     for _ in range(repeats):
         for found, rival in zip(times, rivals, strict=True):

@@ -13,20 +13,20 @@ def _find(rows: Sequence[dict[str, Any]], **wanted: Any) -> dict[str, Any] | Non
 
 
 def rival_of(rows: Sequence[dict[str, Any]], row: dict[str, Any]) -> dict[str, Any] | None:
-    """LAMMPS' best way to do the same: for one replica one core or ranks, for several also serial runs side by side."""
+    """The fastest LAMMPS row for the same case: one core or MPI ranks; for several replicas also serial runs."""
     same = [r for r in rows if (r["engine"], r["law"], r["grains"]) == ("lammps", row["law"], row["grains"])]
     possible = [r for r in same if row["replicas"] > 1 or r["replicas"] == 1]
     return min(possible, key=lambda r: r["us"]) if possible else None
 
 
 def _time(row: dict[str, Any]) -> str:
-    """The best time, and the worst where there were several."""
+    """The best time, and the worst if there were several, as a text."""
     spread = f" - {row['worst']:.3g}" if row.get("worst", row["us"]) > row["us"] else ""
     return f"{row['us']:.3g}{spread}"
 
 
 def markdown(result: dict[str, Any], baseline: dict[str, Any] | None = None) -> str:
-    """The table; with a baseline, every row has its ratio to it."""
+    """The whole table; with a baseline, every row has the ratio of the baseline's time to its own."""
     commit = (result["commit"] or "unknown")[:9]
     versions = result["versions"]
     lines = [
@@ -79,7 +79,7 @@ def markdown(result: dict[str, Any], baseline: dict[str, Any] | None = None) -> 
 
 
 def short(result: dict[str, Any], law: str = "H") -> str:
-    """One line a size: each number of replicas beside LAMMPS' best way."""
+    """The short table, with a line for each N: every number of replicas beside the fastest LAMMPS rows."""
     rows = [row for row in result["rows"] if row["law"] == law]
     counts = sorted({row["replicas"] for row in rows if row["engine"] == "native"})
     title = " | ".join(f"{count} replica{'s' * (count > 1)}" for count in counts)
@@ -102,7 +102,7 @@ def short(result: dict[str, Any], law: str = "H") -> str:
 
 
 def into(text: str, made: str, by: str = "benchmarks/short_table.py") -> str:
-    """A page with what a program has made, in the place of what is there between the marks of that program.
+    """A page in which the text between the marks of a program is replaced by `made`.
 
     Raises:
         ValueError: if the page has no marks.
