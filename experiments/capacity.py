@@ -2,10 +2,10 @@
 
 python experiments/capacity.py [-o capacity] [--packs tetra-325-a,...] [--large tetra-1024-a,tetra-3267-a]
 
-For each pack and gamma0: six signals on the pack as it is and on the same pack one experiment older (what does not
-repeat is a noise), and a kernel of 31 bumps; on --simulated packs all words of 8 bits and an alphabet of 63 too. The
-rest follows from the kernel. Simulations are kept, and studies in capacity.csv are done, so that it goes on where it
-was killed; some 2.5e10 grain-steps in all. What stands in the table is drawn to capacity.png.
+For each pack and gamma0 these are simulated: six signals on the pack, and again on the same pack after one experiment
+(the difference is a noise); a kernel of 31 bumps; and on --simulated packs all words of 8 bits and an alphabet of 63
+waveforms. The rest follows from the kernel. Simulations are kept, and studies in capacity.csv are not repeated, so that
+a killed script goes on; it takes some 2.5e10 grain-steps in all. The table is drawn to capacity.png.
 """
 
 import argparse
@@ -29,12 +29,12 @@ from gmem_jax.physics.material import Material
 from gmem_jax.reading.capacity import candidates, channels, decoded_bits, greedy_alphabet, smallest_distance
 from gmem_jax.show.render_matplotlib import pyplot, save_picture
 
-ROUND_OFF = 1e-9  # of p_sig: what another order of grains, skin or instruction set changes (docs/trust.md)
-TIME_STEP = 2e-3  # of p_sig: what a time step four times shorter changes (docs/trust.md)
+ROUND_OFF = 1e-9  # relative change of p_sig with another order of grains, skin or instruction set (docs/trust.md)
+TIME_STEP = 2e-3  # relative change of p_sig with a time step four times shorter (docs/trust.md)
 FIXED = (1.0, 5.0)  # Pa
 PASCAL = float(Material().modulus)
-SHORT = 8  # bits of the words that are simulated, and of whose recall relative noises are parts
-LONGER = {10: 2, 12: 1}  # bits of words that are only predicted, and draws of noise
+SHORT = 8  # bits of the words that are simulated; relative noises refer to their recall
+LONGER = {10: 2, 12: 1}  # bits of words that are only predicted, and number of draws of noise
 USUAL = 1e-3  # gamma0 of the large packs, of longer words and of alphabets
 SIZES = tuple(2**bits for bits in range(3, 11))
 TRIED = 20000  # candidates for an alphabet
@@ -46,7 +46,7 @@ Noises = dict[str, float]
 
 
 class Case:
-    """A pack at one gamma0; what is simulated on it is kept in a folder."""
+    """A pack at one gamma0; its simulations are kept in a folder."""
 
     def __init__(self, name: str, gamma0: float, t0: float, folder: Path) -> None:
         self.name, self.gamma0 = name, gamma0
@@ -54,9 +54,9 @@ class Case:
         self.parts = Checkpoints(folder / f"{name}-{gamma0:g}.parts", key_of_run(self.experiment))
 
     def repeated(self) -> np.ndarray:
-        """Recalls of the six signals, on the pack and on the same one an experiment without signal older, [2, 6, 256].
+        """Recalls of the six signals, on the pack and on the same pack after an experiment without signal, [2, 6, 256].
 
-        The older one has its grains where they came to rest; springs of friction begin anew, as in any pack.
+        The second pack has its grains where they came to rest; springs of friction begin anew, as in any pack.
         """
 
         def play(_: object) -> np.ndarray:
@@ -80,14 +80,14 @@ class Case:
 
 
 class Table:
-    """The rows there are. A study of a case is done once."""
+    """The rows of the table in a file. A study of a case is done once."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.rows: list[Row] = done(path)
 
     def note(self, case: Case, study: str, found: Iterable[Found]) -> None:
-        """Add what a study finds, unless it is there already."""
+        """Add the rows of a study, unless it is done already."""
         key = {"pack": case.name, "gamma0": f"{case.gamma0:g}", "study": study}
         if self.pick(**key):
             return
@@ -118,7 +118,7 @@ def noise(name: str, part_of_signal: float) -> Iterator[Found]:
 
 
 def carried(kernel: gm.MemoryKernel, deviations: Noises) -> Iterator[Found]:
-    """The upper bound at each noise."""
+    """Rows of the upper bound of the bits at each noise."""
     for name, sd in deviations.items():
         bits = channels(kernel, sd)
         own: Found = {"noise": name, "sd_Pa": sd * PASCAL}
@@ -127,7 +127,7 @@ def carried(kernel: gm.MemoryKernel, deviations: Noises) -> Iterator[Found]:
 
 
 def decoded(signals: np.ndarray, deviations: Noises, draws: int = 4) -> Iterator[Found]:
-    """The lower bound at each noise."""
+    """Rows of the lower bound of the bits at each noise."""
     for name, sd in deviations.items():
         bits, error = decoded_bits(signals, sd, draws=draws)
         own: Found = {"S": len(signals), "noise": name, "sd_Pa": sd * PASCAL}
@@ -135,7 +135,7 @@ def decoded(signals: np.ndarray, deviations: Noises, draws: int = 4) -> Iterator
 
 
 def checked(predicted: np.ndarray, simulated: np.ndarray) -> Iterator[Found]:
-    """How far apart the two nearest simulated recalls are, how good predictions were, and as templates."""
+    """Distance of the two nearest simulated recalls, error of predictions, and accuracy of these as templates."""
     yield {"quantity": "nearest two (Pa)", "S": len(simulated), "value": smallest_distance(simulated) * PASCAL}
     yield {"quantity": "error of prediction", "value": relative(predicted - simulated, simulated)}
     away = np.linalg.norm(simulated[:, None] - predicted[None], axis=2)
@@ -144,7 +144,7 @@ def checked(predicted: np.ndarray, simulated: np.ndarray) -> Iterator[Found]:
 
 
 def distances(kernel: gm.MemoryKernel, alphabet: np.ndarray) -> Iterator[Found]:
-    """The two nearest of an alphabet's first recalls and of as many words', as the kernel predicts them."""
+    """Smallest distances among the first recalls of an alphabet, and among those of as many words, as predicted."""
     for size in SIZES:
         words = kernel.predict(gm.words(size.bit_length() - 1))
         yield {"quantity": "nearest two (Pa)", "S": size, "value": float(alphabet[size - 1]) * PASCAL}
@@ -152,7 +152,7 @@ def distances(kernel: gm.MemoryKernel, alphabet: np.ndarray) -> Iterator[Found]:
 
 
 def deviations(kernel: gm.MemoryKernel, noises: Noises) -> Noises:
-    """Standard deviations in E, of noises given as parts of the words' recall."""
+    """Standard deviations in E of noises that are given as parts of the words' recall; and those of fixed noises."""
     rms = math.sqrt(np.mean(kernel.predict(gm.words(SHORT)) ** 2))
     fixed = {f"{pascals:g} Pa": pascals / PASCAL for pascals in FIXED}
     return {name: share * rms for name, share in noises.items()} | fixed
@@ -167,7 +167,7 @@ def alphabet_of(kernel: gm.MemoryKernel) -> tuple[np.ndarray, np.ndarray, np.nda
 
 
 def predict(table: Table, case: Case, noises: Noises, *, close: bool) -> None:
-    """What follows from the kernel in a moment; of a pack that is looked at closely, alphabets too."""
+    """The studies that follow from the kernel in a moment; if `close`, alphabets too."""
     kernel = case.kernel()
     sd = deviations(kernel, noises)
     table.note(case, "channels", carried(kernel, sd))
@@ -177,7 +177,7 @@ def predict(table: Table, case: Case, noises: Noises, *, close: bool) -> None:
 
 
 def check(table: Table, case: Case, noises: Noises) -> None:
-    """What is to be simulated."""
+    """The studies that need simulations of words and of an alphabet."""
     kernel, words = case.kernel(), gm.words(SHORT)
     found = case.recalled(f"words-{SHORT}", words)
     table.note(case, f"words {SHORT} simulated", decoded(found, deviations(kernel, noises)))
@@ -189,7 +189,7 @@ def check(table: Table, case: Case, noises: Noises) -> None:
 
 
 def lengthen(table: Table, case: Case, noises: Noises) -> None:
-    """Longer words, by the kernel: minutes of fitting."""
+    """The studies of longer words, predicted by the kernel; they take minutes of fitting."""
     kernel = case.kernel()
     for bits, draws in LONGER.items():
         predicted = kernel.predict(gm.words(bits))
@@ -205,7 +205,7 @@ STYLES = {
 
 
 def draw(table: Table, path: Path) -> None:
-    """Bounds against N and against gamma0, and distances against the size of an alphabet."""
+    """Draw the bounds against N and against gamma0, and distances against the size of an alphabet."""
     figure, axes = pyplot().subplots(1, 3, figsize=(15, 4.8))
     usual, small = f"{USUAL:g}", min((row["N"] for row in table.rows), key=int)
     names = list(dict.fromkeys(row["noise"] for row in table.pick(study="channels")))
@@ -250,7 +250,7 @@ def points(rows: list[Row]) -> tuple[list[int], list[float]]:
 
 
 def main() -> None:
-    """The noise between packs first, then each case, and last what takes longest."""
+    """Do the noise between packs first, then each case, and the longest studies last."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-o", "--output", type=Path, default=Path("capacity"), help="folder to write to")
     parser.add_argument("--packs", type=called, default=FIVE, help="two or more of one size")

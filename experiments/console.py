@@ -1,4 +1,4 @@
-"""What the long scripts print, and where they write."""
+"""Progress, outputs and errors of the long scripts."""
 
 import argparse
 import sys
@@ -7,15 +7,15 @@ from pathlib import Path
 
 
 def say(what: str, _: float, fraction: float) -> None:
-    """Progress in one line; a `gmem_jax.simulation.progress.Progress`."""
+    """Print progress in one line; a `gmem_jax.simulation.progress.Progress`."""
     print(f"\r{fraction:5.0%}  {what:24}", end="\n" if fraction >= 1.0 else "", flush=True)
 
 
 def new_folder(text: str) -> Path:
-    """A folder for results that are written at the end: an argument of scripts that do not go on from what there is.
+    """A new or empty folder for results that are written at the end: an argument of scripts that do not resume.
 
     Raises:
-        ArgumentTypeError: if there is something in it.
+        ArgumentTypeError: if the folder is not empty.
     """
     folder = Path(text)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -24,10 +24,10 @@ def new_folder(text: str) -> Path:
 
 
 def new_name(text: str) -> Path:
-    """The name, without a suffix, of a table and a picture that are written at the end, in a folder that is made now.
+    """The name, without a suffix, of a table and a picture that are written at the end; their folder is made now.
 
     Raises:
-        ArgumentTypeError: if one of them is there, or they cannot be.
+        ArgumentTypeError: if one of them exists, or the folder cannot be made.
     """
     name = Path(text)
     if not name.name:
@@ -43,7 +43,7 @@ def new_name(text: str) -> Path:
 
 
 def in_one_line(main: Callable[[], None]) -> None:
-    """Run a script; arguments that cannot be end it with one line, as with `gmem`."""
+    """Run a script; impossible arguments end it with one line, as with `gmem`."""
     try:
         main()
     except (ValueError, OSError) as error:

@@ -1,12 +1,12 @@
-"""What keeps a design from being better: its own slopes, both ways, and what steps along them come to.
+"""What limits a design: its slopes to both sides, and the effect of steps along them.
 
 python experiments/design_limit.py tetra-325-c docs/results/designs/tetra-325-c.csv [--t0 5400] [--bumps 63]
     [--width 0.06]
 
-Of the signal that misses most, every bump is made a little larger and a little smaller (two runs a bump). Said are: how
-much the slopes differ between the two; how much of the miss lies along directions that the recall follows well, badly
-and not at all; and what corrections with less and less damping should leave of it, and leave. Some 150 runs of a
-signal: four minutes of one core for 325 grains at t0 = 5,400.
+Every bump of the signal with the largest miss is made a little larger and a little smaller, in two runs. The script
+prints how much the slopes of both sides differ; how much of the miss lies along directions that the recall follows
+well, badly and not at all; and the miss that corrections with less and less damping should leave and do leave. It takes
+some 150 runs of a signal: four minutes of one core for 325 grains at t0 = 5,400.
 """
 
 import argparse
@@ -40,7 +40,7 @@ def main() -> None:
     experiment = gm.Experiment(gm.load_pack(arguments.pack), gm.six_signals(), t0=arguments.t0)
 
     def recalled(amplitudes: np.ndarray) -> np.ndarray:
-        """Recalls of rows of amplitudes, as samples of their bumps are written."""
+        """Recalls of rows of amplitudes; their bumps are sampled as in a file of waveforms."""
         return np.asarray(gm.run(gm.replace(experiment, signals=sampled(bumps(amplitudes, width))), batch=64).p_sig)
 
     amplitudes = nearest(

@@ -3,11 +3,11 @@
 python experiments/design_words.py [-o designed-words] [--packs tetra-325-a,...] [--bits 3,5,8] [--iterations 3]
     [--drawn 256]
 
-The paper's net has seen inputs only, those of all words. The designed words are read from a run of their own on the
-samples as they are written. A pack's kernel is measured once. Of longer words some are drawn, so that an accuracy p
-of N of them has a standard error of sqrt(p (1 - p) / N); the net and the templates choose among all. Resumes; a row
-for each pack and length goes to words.csv as it comes, and what stands there is drawn to words.png. L = 8 on 325 grains
-at t0 = 1,800 takes some 1e10 grain-steps.
+The paper's net is trained on inputs only, those of all words. The designed words are read from a separate run with the
+samples that are written. A pack's kernel is measured once. Of many words only some are drawn, so that an accuracy p of
+N of them has a standard error of sqrt(p (1 - p) / N); the net and the templates choose among all words. A killed script
+resumes. A row for each pack and length is added to words.csv, which is drawn to words.png. L = 8 on 325 grains at
+t0 = 1,800 takes some 1e10 grain-steps.
 """
 
 import argparse
@@ -75,7 +75,7 @@ def main() -> None:
 
 
 def drawn(count: int, most: int) -> np.ndarray:
-    """Numbers of the words that are designed, of so many."""
+    """Numbers of the words that are drawn: at most `most` of `count`."""
     every = np.arange(count)
     return every if count <= most else np.sort(np.random.default_rng(count).choice(every, most, replace=False))
 
@@ -89,7 +89,7 @@ def design(
     net: Net,
     iterations: int,
 ) -> Row:
-    """Design these words of a length, and read them as they come and designed."""
+    """Design the words with these numbers, and read them before and after."""
     began = time.perf_counter()
     every = gm.words(bits)
     words = replace(every, amplitudes=every.amplitudes[number], centres=every.centres[number])
@@ -117,7 +117,7 @@ def design(
 
 
 def there(table: Path, pack: str, bits: int, words: int, t0: float, iterations: int) -> bool:
-    """Whether the table has these words; what is drawn of it is of one rate and one effort."""
+    """Whether the table has these words; it ends the script if the table has another t0, effort or number of words."""
     rows = done(table)
     for row in rows:
         if (float(row["t0"]), int(row["iterations"])) != (t0, iterations):
@@ -129,7 +129,7 @@ def there(table: Path, pack: str, bits: int, words: int, t0: float, iterations: 
 
 
 def draw(table: Path, path: Path) -> None:
-    """F and what the net reads against L: as they come and designed, mean and SD over packs; and the published."""
+    """Draw F and the net's accuracy against L before and after, mean and SD over packs; and the published values."""
     figure, axes = pyplot().subplots(1, 2, figsize=(10, 4.2))
     rows = done(table)
     sizes = sorted({gm.load_pack(row["pack"]).grains for row in rows})

@@ -4,12 +4,13 @@ python experiments/drawn_words.py [-o drawn-words] [--pack tetra-10240-d] [--bit
     [--dt 1]
 
 All 1,024 words of ten bits on 10,240 grains would take a day of a core; fifteen and the zero signal fill two vectors of
-a CPU and take twenty minutes. A GPU runs 64 in half a minute. Words are drawn without looking; of ten bits the one that
-the paper shows is put in the place of
-the last. F of those drawn stands for F of all within its standard error over words; of an accuracy p the standard error
-is sqrt(p (1 - p) / drawn). The paper's net, which has seen inputs of all words, and the templates choose among all.
-Resumes; recalls are kept. A pack, rate and time step have one table, to which lengths may be added later, and its
-picture. A net that ran out of time is said to have; the same command goes on training it.
+a CPU and take twenty minutes. A GPU runs 64 in half a minute. Words are drawn at random; of ten bits the word that the
+paper shows replaces the last. F of the drawn words estimates F of all within its standard error over words; the
+standard error of an accuracy p is sqrt(p (1 - p) / drawn). The paper's net, trained on inputs of all words, and the
+templates choose among all words.
+
+A killed script resumes, and recalls are kept. Each pack, t0 and time step has one table, to which lengths may be added
+later, and its picture. The script says if a net ran out of time; the same command goes on training it.
 """
 
 import argparse
@@ -83,14 +84,14 @@ def main() -> None:
 
 
 def chosen(bits: int, most: int) -> np.ndarray:
-    """Numbers of the words, the one that the paper shows among them."""
+    """Numbers of the drawn words; of ten bits, with the word that the paper shows."""
     number = drawn(2**bits, most)
     shown = SHOWN_WORD - 1
     return np.sort([*number[:-1], shown]) if bits == SHOWN_OF and shown not in number else number
 
 
 def run(experiment: gm.Experiment, file: Path) -> None:
-    """Run what is not there yet, and keep it."""
+    """Run an experiment, from its finished parts on, and save its recall."""
     parts = Checkpoints(file.with_suffix(".parts"), key_of_run(experiment))
     recall = gm.run(experiment, cache=parts, progress=say)
     gm.save_recall(file, recall)
@@ -98,7 +99,7 @@ def run(experiment: gm.Experiment, file: Path) -> None:
 
 
 def read(experiment: gm.Experiment, recall: gm.Recall, bits: int, number: np.ndarray, net: Net) -> Row:
-    """F by every background, over the ringing period, and what is read of SUB2-BL."""
+    """G and F with every background, after a mean over the ringing period, and the accuracies with SUB2-BL."""
     scale, window = float(experiment.scale), float(recall.window) / float(experiment.t0)
     first, second = (analysis.recalled(jnp.asarray(recall.stages[name].pressure)) for name in recall.protocol.reads)
     row: Row = {"bits": bits, "words": len(number)}
@@ -123,7 +124,7 @@ def read_rows(path: Path) -> list[Row]:
 
 
 def over_packs(rows: list[Row]) -> list[Row]:
-    """One row for each length: means over packs, and words of all; the same words were drawn for each."""
+    """One row for each length, with means over packs; the same words were drawn for each pack."""
     groups: dict[str | int | float, list[Row]] = {}
     for row in rows:
         groups.setdefault(row["bits"], []).append(row)
@@ -136,9 +137,9 @@ def over_packs(rows: list[Row]) -> list[Row]:
 
 
 def draw(rows: list[Row], path: Path, grains: int | None = None) -> None:
-    """F by three backgrounds, and accuracies, against L, beside the published; means where several packs ran.
+    """Draw F with three backgrounds, and accuracies, against L beside the published; means if there are several packs.
 
-    Without the number of grains it is read in the name of a shipped pack.
+    If the number of grains is not given, it is taken from the name of the pack.
     """
     rows = over_packs(rows)
     lengths = np.array([int(row["bits"]) for row in rows])

@@ -2,10 +2,10 @@
 
 python experiments/estimate.py [-o estimate] [--pack tests/data/tetra-27.h5] [--signals 3] [--noise 2] [--samples 100]
 
-Needs blackjax. The recall of some waveforms is read as the means of p_sig over each sixteenth of u, with Gaussian noise
-of `--noise` times their root mean square. For a given pack the recall is a function of mu and k_H, and the logarithm of
-each has a normal prior. NUTS starts from four places, with gradients backwards through all steps: for two numbers they
-cost what two tangents do. The grid says whether the chains found the posterior.
+It needs blackjax. The recall of some waveforms is read as the means of p_sig over each sixteenth of u, with Gaussian
+noise of `--noise` times their root mean square. For a given pack the recall is a function of mu and k_H, and the
+logarithm of each has a normal prior. NUTS starts from four places, with reverse-mode gradients through all steps: for
+two numbers they cost as much as two tangents. The grid shows whether the chains found the posterior.
 """
 
 import argparse
@@ -27,17 +27,17 @@ from gmem_jax.show.render_matplotlib import pyplot, save_picture
 NAMES = {"friction.mu": "friction coefficient $\\mu$", "friction.stiffness": "stiffness $k_H$ (E R)"}
 TICKS = ((0.2, 0.5, 1.0, 2.0), (0.03, 0.1, 0.3))
 TRUE = np.array([0.5, 0.13])
-MIDDLE = np.array([0.7, 0.1])  # of the prior
-WIDTH = 0.5  # of the prior, the standard deviation of each logarithm
-STARTS = np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])  # in widths from the middle
-REACH = 2.5  # of the grid, in widths from the middle
-READINGS = 16  # of each waveform
+MIDDLE = np.array([0.7, 0.1])  # median of the prior
+WIDTH = 0.5  # standard deviation of each logarithm in the prior
+STARTS = np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])  # of the chains, in widths from the middle
+REACH = 2.5  # half width of the grid, in widths of the prior
+READINGS = 16  # readings of each waveform
 
 LogDensity = Callable[[jax.Array], jax.Array]
 
 
 def numbers(place: Any) -> Any:
-    """mu and k_H at a place, which is in widths of the prior from its middle, [..., 2]."""
+    """mu and k_H at places [..., 2], which are given in widths of the prior from its middle."""
     return MIDDLE * jnp.exp(WIDTH * place)
 
 
@@ -92,7 +92,7 @@ def main() -> None:
 
 
 def sample(log_density: LogDensity, key: jax.Array, warm: int, count: int, doublings: int) -> np.ndarray:
-    """Chains [4, count, 2], each tuned by itself, all run together."""
+    """Four chains, [4, count, 2], each tuned by itself, all run together."""
 
     @jax.jit
     @jax.vmap
@@ -129,7 +129,7 @@ def sample(log_density: LogDensity, key: jax.Array, warm: int, count: int, doubl
 
 
 def integrate(log_density: LogDensity, axis: np.ndarray) -> np.ndarray:
-    """The posterior on a square grid, [mu, k_H], its sum 1."""
+    """The posterior on a square grid, [mu, k_H], normalised to a sum of 1."""
     began, row = time.process_time(), jax.jit(jax.vmap(log_density))
     logs = np.asarray([row(jnp.stack([jnp.full(len(axis), mu), jnp.asarray(axis)], axis=1)) for mu in axis])
     print(f"{logs.size} points, {np.isnan(logs).sum()} of them failed, {time.process_time() - began:.0f} s of CPU")
@@ -138,7 +138,7 @@ def integrate(log_density: LogDensity, axis: np.ndarray) -> np.ndarray:
 
 
 def tell(name: str, found: np.ndarray, weights: np.ndarray) -> None:
-    """Means and standard deviations of mu and k_H, [..., 2]."""
+    """Print means and standard deviations of mu and k_H, [..., 2], with weights."""
     mean = np.average(found, axis=(0, 1), weights=np.stack([weights] * 2, -1))
     deviation = np.sqrt(np.average((found - mean) ** 2, axis=(0, 1), weights=np.stack([weights] * 2, -1)))
     print(f"{name}: mu {mean[0]:.3f} +- {deviation[0]:.3f}, k_H {mean[1]:.4f} +- {deviation[1]:.4f}")
@@ -153,7 +153,7 @@ def draw(
     clean: np.ndarray,
     noise: float,
 ) -> None:
-    """What was read of one waveform, the posterior by both ways, and what each number has of it."""
+    """Draw the readings of one waveform, the posterior by NUTS and by the grid, and the marginals of both numbers."""
     figure, ((top, joint), margins) = pyplot().subplots(2, 2, figsize=(10, 8))
     u, grid = (np.arange(READINGS) + 0.5) / READINGS, np.asarray(numbers(np.stack([axis, axis], 1)))
     top.errorbar(u, measured[0] * 1e6, noise * 1e6, fmt="o", ms=4, color="0.4", capsize=2, label="read, ± noise")

@@ -3,8 +3,8 @@
 python experiments/gradient_check.py [-o gradient_check] [--pack tetra-325-a] [--t0 1800]
 
 Three tables and one picture: the Jacobian of a recall by 16 amplitudes, gamma0, mu and k_H; the gradient of the
-fidelity of the six signals by their amplitudes, gamma0, mu and k_H, in both modes; and the error of the pressures'
-derivatives against the number of steps they have come through. At t0 = 1,800 t_c some fifteen minutes on two cores.
+fidelity of the six signals by their amplitudes, gamma0, mu and k_H, in both modes; and the error of the derivatives of
+pressures against the number of steps. At t0 = 1,800 t_c it takes some fifteen minutes on two cores.
 """
 
 import argparse
@@ -36,7 +36,7 @@ def waveform() -> gm.Bumps:
 
 
 def check_jacobian(experiment: gm.Experiment) -> tuple[dict[float, dict[str, float]], dict[float, np.ndarray]]:
-    """Misses of the Jacobian by step size; and those of dp_xy / da in every bin from the encoding on."""
+    """Errors of the Jacobian by step size; and errors of dp_xy / da in every bin from the encoding on."""
     exact = jacobian.exact(experiment, progress=say)
     table, by_bin = {}, {}
     for step in STEPS:
@@ -48,7 +48,7 @@ def check_jacobian(experiment: gm.Experiment) -> tuple[dict[float, dict[str, flo
 
 
 def check_prefix(experiment: gm.Experiment) -> dict[float, np.ndarray]:
-    """Misses of dp / d mu in every bin from the very beginning, by step size."""
+    """Errors of dp / d mu in every bin of the experiment, by step size."""
     mu = value_at(experiment, "friction.mu")
 
     def joined(pressure: Any) -> np.ndarray:
@@ -68,7 +68,7 @@ def check_prefix(experiment: gm.Experiment) -> dict[float, np.ndarray]:
 
 
 def check_fidelity(experiment: gm.Experiment) -> tuple[list[list[Any]], float]:
-    """Rows (parameter, exact, difference at each step) of dF; and how far forward and reverse mode are apart."""
+    """Rows (parameter, exact, difference at each step) of dF; and the relative difference of both modes."""
     names = ("signals.amplitudes", *SCALARS)
     theta = {name: jnp.asarray(value_at(experiment, name)) for name in names}
     reverse = gm.value_and_grad(experiment, names, progress=say)
@@ -103,7 +103,7 @@ def draw(
     whole: dict[float, np.ndarray],
     steps: int,
 ) -> None:
-    """Error against step size and against horizon."""
+    """Draw the errors against the step size and against the number of time steps."""
     figure, (left, middle, right) = pyplot().subplots(1, 3, figsize=(14, 3.9))
     for group in next(iter(table.values())):
         left.loglog(list(table), [row[group] for row in table.values()], "o-", markersize=4, label=group)

@@ -2,9 +2,9 @@
 
 python experiments/joined.py fig14 part.csv part.csv ... -o fig14-paper-t0=5400-packs=1-lengths=3+4-nets=1
 
-Parts are tables that `gmem reproduce` wrote; the whole is a table and a picture by the name of its scale. Of conditions
-that come twice the first are taken. Parts of another figure give what it has in common with this one (`--only mu=1`),
-and what was run at several rates says so (`--rates "1,800 to 18,000"`).
+Parts are tables that `gmem reproduce` wrote; the whole is a table and a picture, named by its scale. If conditions
+occur twice, the first row is taken. From parts of another figure `--only mu=1` takes the rows that belong to this one.
+For parts with several t0, `--rates "1,800 to 18,000"` gives the text for the title.
 """
 
 import argparse

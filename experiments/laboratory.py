@@ -2,12 +2,12 @@
 
 python experiments/laboratory.py [-o laboratory] [--grains 3267] [--seeds 101,102,103] [--words 1024] [--only ...]
 
-Words of three bits at t0 = 1,800 with SUB2-BL, for which an experimenter needs one pack that is read twice. One thing
-at a time is as in a laboratory, and then all together (docs/laboratory.md says what they are). Words of six bits in a
-pack of --words grains say how many bits are read at a gauge's noise. Then one thing at a time is chosen otherwise than
-in the paper, and slopes say what a small change of gamma0 and of delta0 does. Packs are prepared once and kept in the
-folder. Every condition of a pack adds its rows to laboratory.csv and is done once, so that it goes on where it was
-killed. At the end the table is printed, mean and standard error over packs.
+Words of three bits are recalled at t0 = 1,800 with SUB2-BL, for which an experimenter needs one pack, read twice.
+One condition at a time is as in a laboratory, and then all together (docs/laboratory.md lists them). Words of six bits
+in a pack of --words grains show how many bits are read at the noise of a gauge. Then one parameter at a time differs
+from the paper's, and slopes give the effect of a small change of gamma0 and of delta0. Packs are prepared once and kept
+in the folder. Every condition of a pack adds its rows to laboratory.csv and is done once, so that a killed script goes
+on. At the end it prints the table, with mean and standard error over packs.
 """
 
 import argparse
@@ -30,7 +30,7 @@ FEW, MANY = 3, 6  # bits of the words whose F is measured, and of those that are
 NOISES = (1.0, 5.0, 20.0)  # Pa, in each of 256 bins
 PASCAL = float(gm.Material().modulus)
 DT = 0.8  # t_c
-OVERLAP = 0.6  # of the paper's grain
+OVERLAP = 0.6  # overlap of the paper's grain
 WEIGHT = 1e-5  # R / t_c^2: silicone grains of R = 1 mm and E = 1 MPa (docs/physics.md, "Gravity")
 CREEP = {"creep": 1e-3, "creep_fades": 10.0}  # 1 % of a force with each e-fold of time in a stage: 2.3 % a decade
 COLUMNS = ("pack", "N", "condition", "quantity", "value", "seconds")
@@ -42,8 +42,8 @@ class Condition(NamedTuple):
     Attributes:
         prepare: numbers of the recipe.
         run: numbers of the experiment.
-        cycles: with friction, before anything is written.
-        overlap: of the grain's spheres.
+        cycles: number of cycles with friction before the write.
+        overlap: overlap of the grain's spheres.
     """
 
     prepare: dict[str, Any]
@@ -78,7 +78,7 @@ ALL = CONDITIONS | CHOICES | {SLOPES: Condition({}, {})}
 
 
 def prepared(folder: Path, grains: int, seed: int, condition: Condition) -> gm.Pack:
-    """A pack of the folder, made if it is not there."""
+    """A pack of the folder; it is made if it does not exist."""
     shape = {} if condition.overlap == OVERLAP else {"O": condition.overlap}
     numbers = {"grains": grains, "seed": seed, "dt": 0.5, **condition.prepare}
     told = (f"{key}={value:g}" for key, value in (condition.prepare | shape).items())
@@ -90,7 +90,7 @@ def prepared(folder: Path, grains: int, seed: int, condition: Condition) -> gm.P
 
 
 def experiment(pack: gm.Pack, signals: Any, condition: Condition) -> gm.Experiment:
-    """Written once and read twice, after cycles with friction if there are any."""
+    """An experiment with one write and two reads, after cycles with friction, if there are any."""
     common: dict[str, Any] = {"t0": 1.8e3, "dt": DT, "background": "sub2-bl", **condition.run}
     plain = gm.Experiment(pack, signals, store=0.5, **common)
     if not condition.cycles:
@@ -101,7 +101,7 @@ def experiment(pack: gm.Pack, signals: Any, condition: Condition) -> gm.Experime
 
 
 def rms(p_sig: jax.Array) -> jax.Array:
-    """The size of what is to be measured, in Pa."""
+    """Root mean square of recalled signals, in Pa."""
     return jnp.sqrt(jnp.mean(p_sig**2)) * PASCAL
 
 
@@ -124,7 +124,7 @@ def bits(experiment: gm.Experiment) -> Measured:
 
 
 def slopes(experiment: gm.Experiment) -> Measured:
-    """What F and ln(rms) of p_sig change by with ln(gamma0) and with ln(delta0)."""
+    """Derivatives of F and of ln(rms of p_sig) by ln(gamma0) and by ln(delta0)."""
     found: dict[str, float] = {}
     status: Any = 0
     for name, value in {"gamma0": experiment.gamma0, "delta0": experiment.compression}.items():
@@ -141,7 +141,7 @@ def slopes(experiment: gm.Experiment) -> Measured:
 
 
 def main() -> None:
-    """Run what is not done, and print the table."""
+    """Run the missing conditions, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-o", "--output", type=Path, default=Path("laboratory"), help="folder to write to")
     parser.add_argument("--grains", type=int, default=3267)
@@ -179,7 +179,7 @@ def main() -> None:
 
 
 def of_mean(row: Mapping[str, str]) -> tuple[str, str, str]:
-    """What the rows of one mean have in common."""
+    """The values that the rows of one mean have in common."""
     return row["N"], row["condition"], row["quantity"]
 
 

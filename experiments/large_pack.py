@@ -3,10 +3,10 @@
 python experiments/large_pack.py --grains 100450 --seeds 101 --waveforms 3 --dt 0.425 --store 0.5
 python experiments/large_pack.py --grains 1024 --seeds 1,2,3,4,5 [--prepared standard]
 
-A large pack presses for long at the standard speed and never comes to rest everywhere at once, so that a largest speed
-says little of it. `SHORT` presses twice as fast, fixes the piston as soon as the pressure is right within 1 %, and ends
-the last rest at a largest speed of 2e-4 R / t_c. Of a run with six waveforms each is evaluated by itself too. Rows are
-added to a table; packs and recalls are kept and not made again, and what was interrupted goes on.
+At the standard speed the piston presses a large pack for a long time, and the pack never comes to rest everywhere at
+once, so that its largest speed says little. `SHORT` presses twice as fast, fixes the piston as soon as the pressure is
+right within 1 %, and ends the last rest at a largest speed of 2e-4 R / t_c. Each waveform of a run is also evaluated by
+itself. Rows are added to a table; packs and recalls are kept and not made again, and an interrupted script goes on.
 """
 
 import argparse
@@ -74,7 +74,7 @@ def main() -> None:
 
 
 def prepared(file: Path, recipe: Recipe) -> gm.Pack:
-    """The pack of that file; it is made if there is none."""
+    """The pack in a file; it is made if it does not exist."""
     if not file.exists():
         parts = Checkpoints(file.with_suffix(".parts"), {"recipe": asdict(recipe), **sources()})
         gm.save_pack(file, gm.prepare(recipe, cache=parts, progress=say))
@@ -85,7 +85,7 @@ def prepared(file: Path, recipe: Recipe) -> gm.Pack:
 def measured(
     experiment: gm.Experiment, recall: gm.Recall, ran: list[int], those: tuple[int, ...]
 ) -> dict[str, float | int]:
-    """G and F of some of the waveforms that ran, as they are and over the ringing period."""
+    """G and F of some of the waveforms that ran, without and with a mean over the ringing period."""
     rows = np.asarray([ran.index(number) for number in those])
     pair = recall.p_sig[rows], recall.J[rows], experiment.scale
     plain, smooth = analysis.compare(*pair), analysis.compare(*pair, float(recall.window) / float(experiment.t0))
@@ -95,7 +95,7 @@ def measured(
 
 
 def add(path: Path, rows: list[dict[str, Any]]) -> None:
-    """Put rows into a table, in the place of older ones of the same conditions."""
+    """Put rows into a table; they replace older rows of the same conditions."""
     new = {tuple(str(row[name]) for name in CONDITIONS): row for row in [*done(path), *rows]}
     write_csv(path, list(new.values()))
     for row in rows[:1]:

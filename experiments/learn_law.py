@@ -2,9 +2,9 @@
 
 python experiments/learn_law.py [-o learn-law] [--pack tests/data/tetra-27.h5] [--t0 60] [--updates 200]
 
-Needs equinox. The pack's contacts follow a law whose tangential stiffness is k(p) = k_M sqrt(p), p the overlap; that is
-what the fit does not know. It has a network in the place of k(p), and the recalled waveforms alone: optax follows the
-gradient through all steps of the run, in plain JAX, until they agree.
+It needs equinox. The pack's contacts follow a law whose tangential stiffness is k(p) = k_M sqrt(p), where p is the
+overlap. The fit does not know this function: it has a network instead of k(p), and only the recalled waveforms. optax
+follows the gradient through all steps of the run, in plain JAX, until the recalls agree.
 """
 
 import argparse
@@ -28,7 +28,7 @@ from gmem_jax.physics.contact.friction import coulomb
 from gmem_jax.physics.contact.kinematics import Kinematics, transport
 from gmem_jax.show.render_matplotlib import pyplot, save_picture
 
-SCALE = 0.1  # overlap and stiffness are of this order: what the network takes and gives is of order one
+SCALE = 0.1  # order of magnitude of overlap and stiffness: input and output of the network are of order one
 
 
 @jax.tree_util.register_dataclass
@@ -40,7 +40,7 @@ class Learnt:
     mu: float = 1.0
 
     def init(self, contacts: int, replicas: int, dtype: Any) -> jax.Array:
-        """No force yet."""
+        """The history of contacts that begin, without force."""
         return jnp.zeros((contacts, 3, replicas), dtype)
 
     def __call__(self, kin: Kinematics, normal_force: jax.Array, history: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -54,7 +54,7 @@ class Learnt:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Mindlin:
-    """k(p) = k_M sqrt(p)."""
+    """The true stiffness, k(p) = k_M sqrt(p)."""
 
     k_M: float = 0.45
 
@@ -64,7 +64,7 @@ class Mindlin:
 
 
 class Network(eqx.Module):
-    """k(p) of one hidden layer, positive."""
+    """A positive function k(p): a network with one hidden layer."""
 
     inner: jax.Array
     bias: jax.Array
@@ -120,7 +120,7 @@ def main() -> None:
 
 
 def draw(output: Path, laws: dict[str, Callable[[jax.Array], jax.Array]], losses: list[float]) -> None:
-    """The stiffness against the overlap, and how the fit went; the table beside the picture has both."""
+    """Draw the stiffness against the overlap, and the loss of the fit; the table has the stiffness."""
     overlaps = jnp.linspace(0.005, 0.2, 40)
     curves = {name: np.asarray(law(overlaps)) for name, law in laws.items()}
     with output.with_name(f"{output.name}.csv").open("w", newline="") as file:

@@ -2,9 +2,9 @@
 
 python experiments/protocols.py [-o protocols] [--packs tetra-325-a,...] [--studies twice,two-channels,...]
 
-Six signals (or sines, or bumps, where a study says so) at t0 = 1,800; storage is 0.5 t0, since F does not depend on it
-(docs/howto/time_reversal.md). Every study of a pack adds its rows to protocols.csv and is done once, so that it goes on
-where it was killed. At the end the table is printed, mean and standard error over packs.
+Studies store six signals (some store sines or bumps) at t0 = 1,800; storage is 0.5 t0, since F does not depend on it
+(docs/howto/time_reversal.md). Every study of a pack adds its rows to protocols.csv and is done once, so that a killed
+script goes on. At the end it prints the table, with mean and standard error over packs.
 """
 
 import argparse
@@ -34,13 +34,13 @@ jax.config.update("jax_enable_x64", True)
 COLUMNS = ("pack", "N", "t0", "study", "quantity", "value", "seconds")
 PASCAL = float(gm.Material().modulus)
 STORE = 0.5  # t0
-TRAINED = 5e-3  # gamma0 of what is done at u = 1: there 1e-3 moves hardly anything
+TRAINED = 5e-3  # gamma0 of shears at u = 1, where 1e-3 moves hardly anything
 NOISES = (0.2, 1.0, 5.0)  # Pa: about that of an older pack, and two that are the same for all (docs/remember_more.md)
 KERNEL, WIDTH = 15, 0.125  # bumps of a kernel, half a width apart
 
 Found = dict[str, float]
 SIX = gm.six_signals()
-ORDER = np.roll(np.arange(6), 2)  # of the six on a second channel, or in a second write
+ORDER = np.roll(np.arange(6), 2)  # order of the six signals on a second channel, or in a second write
 
 
 def chosen(signals: gm.Bumps, rows: Any) -> gm.Bumps:
@@ -49,18 +49,18 @@ def chosen(signals: gm.Bumps, rows: Any) -> gm.Bumps:
 
 
 def stacked(*parts: gm.Bumps) -> gm.Bumps:
-    """Sets of one width as one."""
+    """Sets of one width, joined to one set."""
     amplitudes, centres = (jnp.concatenate([getattr(p, name) for p in parts]) for name in ("amplitudes", "centres"))
     return gm.Bumps(amplitudes, centres, parts[0].width)
 
 
 def silent(signals: gm.Bumps) -> gm.Bumps:
-    """A set of as many that are zero."""
+    """A set of as many signals that are zero."""
     return replace(signals, amplitudes=0.0 * signals.amplitudes)
 
 
 class Case:
-    """A pack, and the beginnings that its runs have in common."""
+    """A pack, and the shear-free prefixes that its runs have in common."""
 
     def __init__(self, name: str, t0: float) -> None:
         self.name, self.t0, self.pack = name, t0, gm.load_pack(name)
@@ -71,7 +71,7 @@ class Case:
         return gm.Experiment(self.pack, signals, protocol=protocol, t0=self.t0, **more)
 
     def run(self, protocol: gm.Protocol, signals: Any = SIX, **more: Any) -> tuple[gm.Experiment, gm.Recall]:
-        """It, run."""
+        """The experiment of a protocol on this pack, and its recall."""
         one = self.experiment(protocol, signals, **more)
         begun = one.phases[0], one.observe
         if begun not in self._prefixes:
@@ -85,7 +85,7 @@ def rms(values: Any) -> float:
 
 
 def fitted(p_sig: Any, *templates: Any) -> tuple[list[float], float]:
-    """Gains of p_sig on templates by least squares, and the fidelity with the first: what else there is is error."""
+    """Gains of p_sig on templates by least squares, and the fidelity with the first; all else counts as error."""
     series, basis = np.ravel(p_sig), np.stack([np.ravel(one) for one in templates])
     gains = np.linalg.lstsq(basis.T, series, rcond=None)[0]
     return [float(g) for g in gains], 1.0 - float(np.linalg.norm(series - gains[0] * basis[0]) / np.linalg.norm(series))
@@ -167,7 +167,7 @@ def two_channels(case: Case) -> Found:
 
 
 def held(case: Case) -> Found:
-    """What one channel and two can carry at most at a noise; the odd part, and how large the even part is beside it."""
+    """Upper bound of the bits of one channel and of two at each noise; gain of the odd part, and even over odd part."""
     sets = gm.signals(xy=SIX, z=chosen(SIX, ORDER))
     matrix = gm.kernel_matrix(case.experiment(protocols.two_channels(store=STORE), sets), KERNEL, WIDTH, progress=False)
     kernels: dict[str, MemoryKernel | gm.KernelMatrix] = {
@@ -213,7 +213,7 @@ def turned(simulation: Any, state: Any) -> jax.Array:
 
 
 OBSERVED = {"moved": moved, "turned": turned}
-LEVELS = (0.5, 1.0, 1.25)  # of sines that are trained with, one replica each
+LEVELS = (0.5, 1.0, 1.25)  # amplitudes of the sines of the training, one replica each
 
 
 def sines() -> gm.Bumps:
@@ -223,12 +223,12 @@ def sines() -> gm.Bumps:
 
 
 def after_each(recall: gm.Recall, name: str) -> np.ndarray:
-    """What was observed at the end of each read, [R, S + 1]."""
+    """The value of an observer at the end of each read, [R, S + 1]."""
     return np.stack([np.asarray((recall.stages[read].observed or {})[name])[-1] for read in recall.reads])
 
 
 def bend(curve: np.ndarray, at: float) -> float:
-    """Mean of both neighbours of an amplitude of the readout over the value there: 1 for a straight line."""
+    """The mean of the curve at both neighbours of an amplitude, over its value there: 1 for a straight line."""
     place = protocols.READOUT.index(at)
     return float(0.5 * (curve[place - 1] + curve[place + 1]) / curve[place])
 
@@ -262,7 +262,7 @@ def several(case: Case) -> Found:
 
 
 def erased(case: Case) -> Found:
-    """What one slow cycle and vibration leave of a write."""
+    """How much of a write do one slow cycle and vibration leave?"""
     found: Found = {}
     kinds: dict[str, tuple[Callable[..., gm.Protocol], tuple[float, ...]]] = {
         "one cycle": (protocols.erasure_by_shear, (0.0, 3.0, 10.0, 30.0)),
@@ -285,7 +285,7 @@ def stored(case: Case) -> Found:
 
 
 def sheared(case: Case) -> Found:
-    """What answers a shear at u = 1, what returns, and what is dissipated."""
+    """How does a pack respond to shear at u = 1, what returns, and how much is dissipated?"""
     found: Found = {}
     for name, one_sided in (("both sides", False), ("one side", True)):
         _, recall = case.run(protocols.read_by_shear(one_sided=one_sided), observe=OBSERVED)
@@ -337,7 +337,7 @@ def table(rows: list[dict[str, str]]) -> Iterator[str]:
 
 
 def main() -> None:
-    """Run what is not done, and print the table."""
+    """Run the missing studies, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-o", "--output", type=Path, default=Path("protocols"), help="folder to write to")
     parser.add_argument("--packs", default=FIVE)

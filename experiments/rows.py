@@ -1,4 +1,4 @@
-"""Tables that grow while a script runs: what is in them is done."""
+"""Tables that grow while a script runs; a script does not repeat the work of their rows."""
 
 import csv
 from collections.abc import Sequence
@@ -7,12 +7,12 @@ from typing import Any
 
 
 def done(path: Path) -> list[dict[str, str]]:
-    """The rows there are."""
+    """The rows of a table; none if the file does not exist."""
     return list(csv.DictReader(path.open())) if path.exists() else []
 
 
 def note(path: Path, columns: Sequence[str], rows: list[dict[str, Any]]) -> None:
-    """Add rows."""
+    """Add rows to a table."""
     new = not path.exists()
     with path.open("a") as file:
         writer = csv.DictWriter(file, columns, lineterminator="\n")

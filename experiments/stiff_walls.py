@@ -4,7 +4,7 @@ python experiments/stiff_walls.py [-o stiff_walls] [--grains 1024] [--seeds 101,
 
 A pair is the stiffness of walls over that of rigid ones, and k_H. Packs are prepared between the same walls, once for
 each compression, and kept in the folder. Every point adds a row to stiff_walls.csv and is done once. At the end the
-table is printed, mean and standard error over packs, G and F over the ringing period.
+script prints mean and standard error over packs of G and F after a mean over the ringing period.
 """
 
 import argparse
@@ -33,7 +33,7 @@ PLACE = COLUMNS[:7]
 
 
 def prepared(folder: Path, grains: int, seed: int, material: gm.Material, delta0: float) -> gm.Pack:
-    """A pack of the folder, made if it is not there."""
+    """A pack of the folder; it is made if it does not exist."""
     name = f"tetra-{grains}-{seed}-walls={material.wall_rigidity:g}-delta0={delta0:g}"
     path = folder / f"{name}.h5"
     if not path.exists():
@@ -43,7 +43,7 @@ def prepared(folder: Path, grains: int, seed: int, material: gm.Material, delta0
 
 
 def main() -> None:
-    """Run what is not done, and print the table."""
+    """Run the missing points, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-o", "--output", type=Path, default=Path("stiff_walls"), help="folder to write to")
     parser.add_argument("--grains", type=int, default=1024)

@@ -1,9 +1,10 @@
-"""What superposition knows: recalls predicted from a pack's memory kernel beside recalls that were simulated.
+"""How good superposition is: recalls predicted from a pack's memory kernel beside simulated recalls.
 
 python experiments/superposition.py [-o superposition] [--packs tetra-325-a,tetra-325-b,tetra-325-c] [--t0 1800]
 
-The six signals at several gamma0, all words of 3 to 5 bits, and (on the first pack) of 8 bits, which are classified
-too. "Linear" uses the odd part of the kernel alone, "both" the even part besides. Some twenty minutes on two cores.
+The signals are the six at several gamma0, all words of 3 to 5 bits, and on the first pack all words of 8 bits, which
+are also classified. "Linear" uses only the odd part of the kernel, "both" also the even part. It takes some twenty
+minutes on two cores.
 """
 
 import argparse
@@ -35,7 +36,7 @@ def error(predicted: np.ndarray, simulated: np.ndarray) -> float:
 
 
 def compare(experiment: gm.Experiment, prefix: Prefix, n: int, width: float) -> dict[str, Any]:
-    """Predictions of the experiment's signals from a kernel on n bumps that can form them, and their simulation."""
+    """Predictions of an experiment's signals from a kernel on n bumps, of which they are sums; and their simulation."""
     kernel = gm.memory_kernel(experiment, n, width, prefix=prefix)
     simulated = np.asarray(run(experiment, prefix=prefix).p_sig)
     both, linear = kernel.predict(experiment.waveforms), kernel.predict(experiment.waveforms, even=False)
@@ -50,13 +51,13 @@ def compare(experiment: gm.Experiment, prefix: Prefix, n: int, width: float) -> 
 
 
 def of_words(bits: int) -> tuple[int, float]:
-    """Number and width of bumps, half a width apart, among which are those that words are made of."""
+    """Number and width of bumps half a width apart; the bumps of words are among them."""
     width = bit_width(bits)
     return round(2.0 / width) - 1, width
 
 
 def draw(path: Path, rows: list[list[Any]], six: dict[str, Any], title: str) -> None:
-    """The six recalls beside their predictions, and errors against gamma0 and against the number of bits."""
+    """Draw the six recalls beside their predictions, and errors against gamma0 and against the number of bits."""
     figure, axes = pyplot().subplots(2, 4, figsize=(14, 6))
     pascal, u = Material().modulus, bin_centres()
     for number, axis in enumerate((*axes[0, :3], *axes[1, :3])):
