@@ -1,8 +1,8 @@
-"""gpu.md of this folder: what a step takes of a GPU and how long it takes.
+"""gpu.md of this folder: the resources of a GPU that a step takes, and its time.
 
-python benchmarks/gpu.py             # all of it, where there is a GPU
-python benchmarks/gpu.py --times-to FILE   # there: the times alone
-python benchmarks/gpu.py --times FILE      # anywhere: the page, of these times
+python benchmarks/gpu.py                   # on a machine with a GPU: the whole page
+python benchmarks/gpu.py --times-to FILE   # on a machine with a GPU: only the times
+python benchmarks/gpu.py --times FILE      # on any machine: the page with these times
 """
 
 import argparse

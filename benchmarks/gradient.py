@@ -1,10 +1,11 @@
-"""What a gradient of the fidelity costs, in forward runs: CPU seconds of `gm.run` and `gm.value_and_grad` in turn.
+"""The cost of a gradient of the fidelity in forward runs: CPU seconds of `gm.run` and `gm.value_and_grad` in turn.
 
     GMEM_THREADS=1 python benchmarks/gradient.py --pack tetra-325-a --t0 450 --repeats 5
 
-Six signals. "waveforms" are derivatives by all amplitudes, which the shear-free prefix does not depend on; "all" are
-those by the waveforms, gamma0 and the friction law, through the prefix too. With `--second` also a product of the
-matrix of second derivatives by the amplitudes with one direction. A first round compiles and is not counted.
+The six signals are stored. "waveforms" are derivatives by all amplitudes, on which the shear-free prefix does not
+depend; "all" are those by the waveforms, gamma0 and the friction law, through the prefix too. `--second` adds the
+product of the matrix of second derivatives by the amplitudes with one direction. A first round compiles and is not
+counted.
 """
 
 import argparse
@@ -22,7 +23,7 @@ NAMES = {"waveforms": ["signals.amplitudes"], "all": ["signals", "gamma0", "fric
 
 
 def cpu_seconds(run: Callable[[], Any]) -> float:
-    """CPU time of this process, all threads."""
+    """CPU time of this process during a call, over all threads."""
     before = time.process_time()
     jax.block_until_ready(jax.tree.leaves(run()))
     return time.process_time() - before

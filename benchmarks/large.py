@@ -1,10 +1,10 @@
-"""Large packs: memory and time of a step, where no prepared pack is at hand.
+"""Large packs: memory and time of a step, without a prepared pack of this size.
 
     python benchmarks/large.py --grains 100450 --replicas 1 8 --steps 200
 
-Copies of a shipped pack are set side by side until there are enough grains: what a step costs depends on how many
-touch, not on whether the whole is at rest. Each number of replicas runs in a process of its own; its memory is what
-the process has at most beyond what it had before the replicas were made.
+Copies of a shipped pack are set side by side until there are enough grains: the cost of a step depends on the number of
+contacts, not on whether the whole is at rest. Each number of replicas runs in a process of its own; its memory is the
+peak of the process less the memory before the replicas were made.
 """
 
 import argparse
@@ -34,7 +34,7 @@ def heap(grains: int, source: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def resident(name: str) -> int:
-    """Bytes of memory of this process by a line of its status: VmRSS now, VmHWM at most."""
+    """Bytes of memory of this process, from a line of its status: VmRSS, the present value, or VmHWM, the peak."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(name))
 
@@ -67,7 +67,7 @@ def measure(grains: int, replicas: int, steps: int, source: str) -> dict[str, fl
     moved = 1e-5 * jnp.arange(1.0, steps + 1)[:, None, None] * jnp.linspace(0.9, 1.1, replicas) * jnp.ones((3, 1))
     still = jnp.zeros_like(moved)
     walls = Box(still, jnp.asarray(lengths)[:, None] - moved, still, still)
-    jax.block_until_ready(march(system, state, walls, 0.3, 0.0))  # which compiles
+    jax.block_until_ready(march(system, state, walls, 0.3, 0.0))  # compiles
     began = time.perf_counter()
     state, _ = jax.block_until_ready(march(system, state, walls, 0.3, 0.0))
     seconds = time.perf_counter() - began

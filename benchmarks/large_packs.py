@@ -2,11 +2,11 @@
 
     python benchmarks/large_packs.py [--t0 1.8e4] [--seconds 4] [--errors tetra-325-a tetra-325-b ...] [--only-errors]
 
-With --only-errors they are printed, and nothing is written.
+With --only-errors the errors are printed, and nothing is written.
 
-Each size and number of replicas is timed in both precisions in turn, so that what else the machine does meets both; a
-number is the best of the calls, and beside it stands their median. Errors are those of whole recalls at t0 = 1.8e3
-against double precision.
+Each size and number of replicas is timed in both precisions in turn, so that other load of the machine affects both. A
+time is the best of the calls, with their median beside it. Errors are those of whole recalls at t0 = 1.8e3 against
+double precision.
 """
 
 import argparse

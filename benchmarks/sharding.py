@@ -2,8 +2,8 @@
 
     python benchmarks/sharding.py --devices 1 2 4 8 --pack tetra-325-a --replicas 8 --backend native
 
-One machine has as many cores however many devices it is split into: what is asked is that a step does not get slower
-by gathering what the devices hold. Each process also times the same march on one of its devices.
+The number of cores does not depend on the number of devices: the question is whether a step gets slower because data of
+the devices are gathered. Each process also times the same march on one of its devices.
 """
 
 import argparse
@@ -22,12 +22,12 @@ def measure(pack: str, replicas: int, backend: str, steps: int, repeats: int) ->
         pack: name of a pack that ships.
         replicas: B, a multiple of the number of devices.
         backend: "jax" or "native".
-        steps: in one march.
-        repeats: marches timed; the fastest counts.
+        steps: number of steps in one march.
+        repeats: number of marches that are timed; the fastest counts.
 
     Returns:
-        devices; alone and shared, microseconds of wall time per grain-step; and gathers, the number of operations that
-        send replicas between devices.
+        "devices", their number; "alone" and "shared", microseconds of wall time per grain-step on one device and on
+        all; and "gathers", the number of operations that send replicas between devices.
     """
     import jax
     import jax.numpy as jnp
@@ -74,7 +74,7 @@ def measure(pack: str, replicas: int, backend: str, steps: int, repeats: int) ->
 
 
 def main() -> None:
-    """Print a table, or (in a process of one number of devices) one JSON object."""
+    """Print a table; or, in the process for one number of devices, a JSON object."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--devices", type=int, nargs="+", default=[1, 2, 4, 8])
     parser.add_argument("--pack", default="tetra-325-a")

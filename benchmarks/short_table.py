@@ -1,4 +1,4 @@
-"""Put the short table of bench.json, as `gmem bench -o benchmarks` left it, into docs/speed.md.
+"""Put the short table of bench.json, which `gmem bench -o benchmarks` writes, into docs/speed.md.
 
 python benchmarks/short_table.py
 """

@@ -1,9 +1,9 @@
-"""What a sweep costs beside its runs: one sweep by `gmem sweep`, and the same points by one call in one process.
+"""The overhead of a sweep: one sweep by `gmem sweep`, and the same points by one call in one process.
 
     python benchmarks/sweeping.py --pack tetra-1024-a --mu 0.4 0.5 0.6 0.7 0.8 0.9 --t0 1800 --repeats 2
 
-Both are whole processes, in turn; wall time and CPU time of each, children included. What is left after compiling once
-is what counts: both keep compiled programs, so a first pair is not counted.
+Both are whole processes, run in turn; wall time and CPU time include their children. Both keep compiled programs, so
+that the first pair, which compiles, is not counted.
 """
 
 import argparse
@@ -39,7 +39,7 @@ def timed(command: list[str]) -> tuple[float, float]:
 
 
 def main() -> None:
-    """Print a line a run, and the ratio of the best ones."""
+    """Print a line for each run, and the ratio of the best runs."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--pack", default="tetra-1024-a")
     parser.add_argument("--mu", nargs="+", default=["0.4", "0.5", "0.6", "0.7", "0.8", "0.9"])

@@ -2,9 +2,9 @@
 
     python benchmarks/trust.py --folder trust --studies order skin --json trust.json
 
-Time step, skin of the neighbour list, duration of a compression, points of M2, order of the grains, compiler and
-instruction set: each study changes one of them on two packs of 325 grains and six signals. Finished runs are kept in
-the folder and not done again. Every run of the study "builds" is a process of its own with its own library.
+Each study changes one of these on two packs of 325 grains with six signals: time step, skin of the neighbour list,
+duration of a compression, points of M2, order of the grains, compiler and instruction set, backend. Finished runs are
+kept in the folder and not repeated. In the study "builds" every run with another library is a process of its own.
 """
 
 import argparse
@@ -37,10 +37,10 @@ class Piece(NamedTuple):
     """One run.
 
     Attributes:
-        study: what is varied.
-        label: its value.
-        pack: the pack's name.
-        changes: fields of the experiment, and what else `run_piece` knows; {} for the usual run.
+        study: name of the study.
+        label: value of the varied quantity.
+        pack: name of the pack.
+        changes: fields of the experiment, and other keys that `run_piece` knows; {} for the usual run.
     """
 
     study: str
@@ -50,7 +50,7 @@ class Piece(NamedTuple):
 
     @property
     def file(self) -> str:
-        """Where its result is kept; studies share the usual run."""
+        """The file of its result; studies share the usual run."""
         what = "-".join(f"{name}={value}" for name, value in self.changes.items()) or "usual"
         return f"{self.pack}-{what}.npz".replace(" ", "_")
 
@@ -72,7 +72,7 @@ def pieces(studies: list[str]) -> Iterator[Piece]:
 
 
 def run_piece(piece: Piece, file: Path) -> None:
-    """Run one and write G, F, p_sig, status and seconds."""
+    """Do one run, and write G, F, p_sig, status and seconds."""
     import jax
 
     jax.config.update("jax_enable_x64", True)
@@ -112,7 +112,7 @@ def run_piece(piece: Piece, file: Path) -> None:
 
 
 def use_build(name: str, folder: Path) -> None:
-    """Have this process load a library of another build, compiled if it is not there yet."""
+    """Let this process load the library of another build, which is compiled if it does not exist."""
     from gmem_jax.native import build
     from gmem_jax.native import library as loaded
 
@@ -122,14 +122,14 @@ def use_build(name: str, folder: Path) -> None:
         os.environ["CXX"] = cxx
         build.FLAGS = tuple(optimise if flag == "-O3" else flag for flag in build.FLAGS)
         build.build(library)
-    build.source_hash = lambda: ""  # its flags are others on purpose
+    build.source_hash = lambda: ""  # its flags differ on purpose
     loaded.path = lambda: library
     if instructions:
         os.environ["GMEM_ISA"] = instructions
 
 
 def rows(done: list[tuple[Piece, Path]]) -> list[dict[str, Any]]:
-    """The table: beside G and F, how far p_sig is from the study's first run on the same pack."""
+    """The rows of the table: G, F, and the relative distance of p_sig from the study's first run on the same pack."""
     import numpy as np
 
     reference: dict[tuple[str, str], Any] = {}
@@ -153,7 +153,7 @@ def rows(done: list[tuple[Piece, Path]]) -> list[dict[str, Any]]:
 
 
 def main() -> None:
-    """Run what is not done yet and print the table."""
+    """Do the missing runs and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     known = ["order", "skin", "builds", "t0", "dt", "points", "backends"]
     parser.add_argument("--studies", nargs="+", choices=known, default=known)
