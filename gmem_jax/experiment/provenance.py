@@ -48,7 +48,7 @@ def code() -> dict[str, Any]:
 
 @functools.cache
 def sources() -> dict[str, Any]:
-    """What numbers depend on beside a configuration: a hash of this package's code, and versions of libraries."""
+    """A hash of the code that makes numbers, and versions of libraries: numbers depend on them, too."""
     root = Path(__file__).resolve().parents[1]
     digest = hashlib.sha256()
     for folder in ("physics", "native", "simulation", "experiment", "preparation"):

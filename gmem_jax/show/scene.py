@@ -27,7 +27,7 @@ class Colouring:
     Attributes:
         label: name of the quantity.
         unit: unit of the values; "" for a plain number.
-        values: of every grain in every frame, none below zero, [F, N].
+        values: value of every grain in every frame, never below zero, [F, N].
     """
 
     label: str
