@@ -40,7 +40,7 @@ def timed(command: list[str]) -> tuple[float, float]:
 
 def main() -> None:
     """Print a line for each run, and the ratio of the best runs."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pack", default="tetra-1024-a")
     parser.add_argument("--mu", nargs="+", default=["0.4", "0.5", "0.6", "0.7", "0.8", "0.9"])
     parser.add_argument("--t0", default="1800")

@@ -78,7 +78,7 @@ RUBBED = {  # array of frames between walls with friction; else it is missing
 }
 
 FRAMES = {  # configurations along the run that made a recall or a pack, in frames
-    "time": Array("real", ("frame",), "t_c", "since the beginning"),
+    "time": Array("real", ("frame",), "t_c", "time since the beginning of the run"),
     "u": Array("real", ("frame",), "1", "compression variable"),
     "position": Array("real", ("frame", "grain", "axis"), "R", "centres of the grains"),
     "quaternion": Array("real", ("frame", "grain", "component"), "1", "orientations of the grains"),
@@ -86,7 +86,7 @@ FRAMES = {  # configurations along the run that made a recall or a pack, in fram
     "upper": Array("real", ("frame", "axis"), "R", "upper planes of the box"),
     "start": Array("whole", ("boundary",), "1", "contacts of frame f are rows start[f] to start[f + 1]"),
     "spheres": Array("whole", ("contact", "side"), "1", "spheres i < j that touch; sphere k of grain n is n K + k"),
-    "normal_force": Array("real", ("contact",), "E R^2", "by which they repel each other"),
+    "normal_force": Array("real", ("contact",), "E R^2", "repulsive normal force"),
     "friction_force": Array("real", ("contact", "axis"), "E R^2", "tangential force on i, the opposite of that on j"),
     "offsets": Array("real", ("part", "axis"), "R", "centres of the spheres of a grain, in its own frame"),
 }
@@ -105,16 +105,18 @@ PACK = Schema(
         "clump/offsets": Array("real", ("part", "axis"), "R", "centres of the spheres of a grain, in its own frame"),
         "clump/mass": Array("real", (), "rho R^3", "mass of a grain"),
         "clump/inertia": Array("real", ("axis",), "rho R^5", "principal moments of inertia of a grain"),
-        "clump/diameter": Array("real", (), "R", "of the sphere about a grain's centre that holds it"),
+        "clump/diameter": Array("real", (), "R", "diameter of the sphere about its centre that encloses a grain"),
         "pairs/candidates": Array("whole", ("side", "candidate"), "1", "numbers of the spheres that may touch"),
-        "pairs/reference": Array("real", ("sphere", "axis"), "1", "where the list was made, in parts of the box"),
+        "pairs/reference": Array(
+            "real", ("sphere", "axis"), "1", "spheres when the list was made, in parts of the box"
+        ),
         "pairs/smallest": Array("real", ("axis",), "R", "edges of the box at u = 1, for which the list was made"),
         "pairs/reach": Array("real", (), "R", "distance up to which spheres are listed"),
     },
     {
-        "name": "of the pack",
+        "name": "name of the pack",
         "record": "JSON: the recipe with its seed, what was measured at rest, versions, commit, device",
-        "boundary": 'of a box that is periodic: "periodic", or like "periodic,periodic,walls"; else it is missing',
+        "boundary": 'boundary of a periodic box: "periodic", or like "periodic,periodic,walls"; missing with six walls',
         "clump: shape": 'like "tetra(0.6)"',
         "clump: isotropic": "whether its three moments are equal",
     },
@@ -124,7 +126,7 @@ PACK = Schema(
 RECALL = Schema(
     "gmem-recall/0.1",
     "Recall (.h5)",
-    "What a pack gave back of S signals: `gmem recall`, `gmem demo`, the points of a sweep, `gm.save_recall`.",
+    "The recall of S signals: `gmem recall`, `gmem demo`, the points of a sweep, `gm.save_recall`.",
     {
         "u": Array("real", ("u",), "1", "centres of the bins of u, or of the time of a read in which u stands still"),
         "signal": Array("text", ("signal",), "1", "names of the signals; words by their bits"),
@@ -136,10 +138,10 @@ RECALL = Schema(
         "fidelity": Array("real", (), "1", "F of the set"),
         "windowed_gain": Array("real", (), "1", "G after a running mean over the ringing period"),
         "windowed_fidelity": Array("real", (), "1", "F after a running mean over the ringing period"),
-        "window": Array("real", (), "t_c", "T1, that period"),
+        "window": Array("real", (), "t_c", "T1, the ringing period"),
         "signal_gain": Array("real", ("signal",), "1", "G of each signal by itself; NaN of silence"),
         "signal_fidelity": Array("real", ("signal",), "1", "F of each signal by itself, with that gain"),
-        "signal_windowed_fidelity": Array("real", ("signal",), "1", "the same after a running mean over T1"),
+        "signal_windowed_fidelity": Array("real", ("signal",), "1", "F of each signal after a running mean over T1"),
         "signal_correlation": Array("real", ("signal",), "1", "correlation of each p_sig with its J"),
         "residual_speed": Array("real", ("replica",), "1", "largest grain speed before the readout, over the walls'"),
         "status": Array("whole", ("replica",), "1", "bits of gm.Status; 0 is sound"),
@@ -153,13 +155,13 @@ KERNEL = Schema(
     "Memory kernel (.h5)",
     "The linear part of a pack's memory, measured on n bumps: `gmem kernel`.",
     {
-        "u": Array("real", ("u",), "1", "compression variable where it is read, centres of the bins"),
-        "centres": Array("real", ("bump",), "1", "v, where the bumps of shear lie"),
+        "u": Array("real", ("u",), "1", "compression variable of the recall, centres of the bins"),
+        "centres": Array("real", ("bump",), "1", "v, centres of the bumps of shear"),
         "width": Array("real", (), "1", "width of the bumps, in u"),
         "kernel": Array("real", ("u", "bump"), "E", "M(u, v), recall over the integral of the bump"),
         "odd": Array("real", ("bump", "u"), "E", "half the difference of the recalls of a bump and its opposite"),
-        "even": Array("real", ("bump", "u"), "E", "half their sum; 0 for a linear memory"),
-        "gamma0": Array("real", (), "1", "shear amplitude they were measured at"),
+        "even": Array("real", ("bump", "u"), "E", "half the sum of these recalls; 0 for a linear memory"),
+        "gamma0": Array("real", (), "1", "shear amplitude of the measurement"),
         "delta0": Array("real", (), "1", "areal compression"),
     },
     _CONFIGURATION,
@@ -188,7 +190,7 @@ def declared_of_recall(reads: int, channels: int, *, own_steps: bool = False) ->
 
 _RUN = {
     "seconds": Array("real", (), "s", "wall time of the call that finished the run"),
-    "status": Array("whole", (), "1", "0: nothing broke; what is doubtful a recall says"),
+    "status": Array("whole", (), "1", "0: no run failed; warnings stand in the recall itself"),
 }
 _MADE = {**_RUN, "configuration": Array("object", (), "", _CONFIGURATION["configuration"])}
 
@@ -197,7 +199,7 @@ GRADIENT = Schema(
     "Gradient (.json)",
     "Exact derivatives of the fidelity: `gmem gradient`.",
     {
-        "pack": Array("text", (), "", "its file or name"),
+        "pack": Array("text", (), "", "file or name of the pack"),
         "fidelity": Array("real", (), "1", "F"),
         "places": Array("rows", ("signal", "place"), "1", "u where each waveform can be changed"),
         "gradient/waveform": Array("rows", ("signal", "place"), "1", "dF by the height of the waveform there"),
@@ -213,12 +215,12 @@ TUNED = Schema(
     "Tuned drive (.json)",
     "The drive with the best mean fidelity of some packs: `gmem tune`.",
     {
-        "packs": Array("list", ("pack",), "", "their files or names"),
-        "before": Array("real", (), "1", "mean F of the drive that was begun with"),
+        "packs": Array("list", ("pack",), "", "files or names of the packs"),
+        "before": Array("real", (), "1", "mean F of the initial drive"),
         "fidelity": Array("real", (), "1", "mean F of the best drive"),
-        "each": Array("real", ("pack",), "1", "F of every pack with it"),
+        "each": Array("real", ("pack",), "1", "F of every pack with the best drive"),
         "values": Array("object", (), "", "gamma0 (1), mu (1) and stiffness (E R) of the best drive"),
-        "history": Array("list", ("iteration",), "", "those values and their mean F after every iteration"),
+        "history": Array("list", ("iteration",), "", "values and their mean F after every iteration"),
         **_MADE,
     },
 )
@@ -228,8 +230,8 @@ READING = Schema(
     "Classification (.json)",
     "How well the words of a recall are read: `gmem classify`.",
     {
-        "recall": Array("text", (), "", "the file that was read"),
-        "pack": Array("text", (), "", "its pack"),
+        "recall": Array("text", (), "", "file of the recall"),
+        "pack": Array("text", (), "", "pack of the recall"),
         "bits": Array("whole", (), "1", "length L of the words"),
         "words": Array("whole", (), "1", "number of words, 2^L"),
         "background": Array("text", (), "", "how the background was subtracted"),
@@ -252,7 +254,8 @@ DESIGN = Schema(
     "",
     "Waveforms (.csv)",
     "A column for each signal, row k of n at u = k / (n + 1), 0 at both ends: for `gmem recall --signals`. `gmem "
-    "design` writes comments above: `# target:` the waveforms whose recall they imitate, `# design:` how it went.",
+    "design` writes comments above: `# target:` the waveforms whose integrals J the recalls shall follow, `# design:` "
+    "the course of the design.",
     {
         "signal_1, ...": Array("real", ("sample",), "1", "I(u) in parts of gamma0"),
         "# target": Array("object", (), "", "JSON: the wanted waveforms, as in a configuration"),
@@ -266,7 +269,7 @@ NET = Schema(
     "The reader of words of one length and seed, finished or not: `gmem classify --nets`. 512 bytes of checksum, then "
     "MessagePack as flax writes it.",
     {
-        "recipe": Array("text", (), "", "JSON: gm.classify.TrainingConfig, what it was built and taught from"),
+        "recipe": Array("text", (), "", "JSON: gm.classify.TrainingConfig, its layers and training data"),
         "training": Array("object", (), "", "seed, steps, loss (nats), validation accuracy, seconds"),
         "parameters/Dense_k/kernel": Array("real", ("inputs", "outputs"), "1", "weights of layer k, float32"),
         "parameters/Dense_k/bias": Array("real", ("outputs",), "1", "biases of layer k, float32"),
@@ -279,9 +282,9 @@ SWEEP = Schema(
     "`gmem sweep`: points/KEY.h5 are recalls, packs/KEY.h5 packs; `gmem sweep export` makes one table of them. "
     "sweep.json holds:",
     {
-        "names": Array("list", ("name",), "", "what varies"),
+        "names": Array("list", ("name",), "", "names of the values that vary"),
         "shared": Array("object", (), "", "the values that all points have"),
-        "points": Array("list", ("point",), "", "values and key of each point; what is not computed has no file"),
+        "points": Array("list", ("point",), "", "values and key of each point, which has a file once computed"),
     },
 )
 
