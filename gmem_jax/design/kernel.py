@@ -22,6 +22,7 @@ from gmem_jax.physics.numbers import plural, require_numbers, require_whole
 from gmem_jax.physics.pytree import comparable, short_repr
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.checkpoints import ResultCache, no_cache
+from gmem_jax.simulation.compiled import require_x64
 from gmem_jax.simulation.progress import ProgressChoice, callback, shows_progress, within
 from gmem_jax.simulation.stage import BINS, bin_centres
 
@@ -185,6 +186,7 @@ def memory_kernel(
             several reads or channels.
         RunFailedError: if the simulation broke down.
     """
+    require_x64()
     require_kind("memory_kernel", experiment, Experiment)
     tell, both = callback(progress), _basis(experiment, n, width)
     if len(experiment.readings.reads) * len(experiment.readings.channels) > 1:
@@ -263,6 +265,7 @@ def kernel_matrix(
             reads, or not a set of waveforms for each channel.
         RunFailedError: if the simulation broke down.
     """
+    require_x64()
     require_kind("kernel_matrix", experiment, Experiment)
     channels, written = experiment.readings.channels, written_sets(experiment)
     loud = _basis(experiment, n, width)

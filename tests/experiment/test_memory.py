@@ -4,6 +4,7 @@ import dataclasses
 import json
 import warnings
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -189,6 +190,13 @@ def test_single_precision_is_refused(pack: gm.Pack) -> None:
     for run in (gm.run, gm.recall):
         with jax.enable_x64(False), pytest.raises(ValueError, match="float64 is needed"):
             run(experiment)
+
+
+@pytest.mark.parametrize("measure", [gm.memory_kernel, gm.kernel_matrix])
+def test_single_precision_is_refused_before_a_bump_is_made(pack: gm.Pack, measure: Any) -> None:
+    experiment = gm.Experiment(pack, gm.six_signals())
+    with jax.enable_x64(False), pytest.raises(ValueError, match="float64 is needed"):
+        measure(experiment, n=3, width=0.3)
 
 
 def test_batches_are_one_run_and_can_be_resumed(pack: gm.Pack, recall: gm.Recall, tmp_path: Path) -> None:
