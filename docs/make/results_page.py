@@ -30,7 +30,8 @@ HERE = Path(__file__).parents[1] / "results"
 JOINED = {  # figures that no one command makes
     "fig12b-paper": "Fig. 6 of this scale, figs. 8 and 12b of smaller ones, "
     "`--scale workstation,sizes=31680,few=1` and `experiments/large_pack.py`, put together by `experiments/joined.py`. "
-    "The point of 31,680 grains is one pack at t0 = 5,400; three packs at 18,000 have G = 0.374 ± 0.004 ([every point](points.md))",
+    "The point of 31,680 grains is one pack at t0 = 5,400; three packs at 18,000 have G = 0.374 ± 0.004 "
+    "([every point](points.md))",
     **dict.fromkeys(
         points.WHICH, "Sweeps of single packs ([table](points.csv), [how](runs.md#points-of-10240-grains))"
     ),

@@ -186,8 +186,8 @@ def memory_kernel(
             several reads or channels.
         RunFailedError: if the simulation broke down.
     """
-    require_x64()
     require_kind("memory_kernel", experiment, Experiment)
+    require_x64()
     tell, both = callback(progress), _basis(experiment, n, width)
     if len(experiment.readings.reads) * len(experiment.readings.channels) > 1:
         raise ValueError("a kernel is of one read and one channel; gm.kernel_matrix measures those of several channels")
@@ -265,8 +265,8 @@ def kernel_matrix(
             reads, or not a set of waveforms for each channel.
         RunFailedError: if the simulation broke down.
     """
-    require_x64()
     require_kind("kernel_matrix", experiment, Experiment)
+    require_x64()
     channels, written = experiment.readings.channels, written_sets(experiment)
     loud = _basis(experiment, n, width)
     tell, columns = callback(progress), []
