@@ -25,7 +25,7 @@ from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache, no_cache
 from gmem_jax.simulation.compiled import Compiled, require_x64
 from gmem_jax.simulation.frames import FrameRecorder, FrameSchedule, concatenate, places, places_at
 from gmem_jax.simulation.observers import CHUNK
-from gmem_jax.simulation.progress import Progress, ProgressChoice, callback, shows_progress, silent, work_of
+from gmem_jax.simulation.progress import ProgressChoice, callback, shows_progress, work_of
 from gmem_jax.simulation.runner import Runner, raise_if_fatal, status_of
 from gmem_jax.simulation.sample import Sample
 from gmem_jax.simulation.sharding import placement_of
@@ -96,7 +96,8 @@ def _key_of_prefix(experiment: Experiment) -> str:
 
 
 @usual_rules()
-def prefix_of(experiment: Experiment, *, cache: ResultCache = no_cache, progress: Progress = silent) -> Prefix:
+@shows_progress
+def prefix_of(experiment: Experiment, *, cache: ResultCache = no_cache, progress: ProgressChoice = None) -> Prefix:
     """Run the stages before the first waveform once, for use in any number of calls of `run`.
 
     They are common to all waveforms on one pack, under one law and protocol.
@@ -104,7 +105,7 @@ def prefix_of(experiment: Experiment, *, cache: ResultCache = no_cache, progress
     Args:
         experiment: the experiment; its waveforms, gamma0 and shear_share do not matter.
         cache: see `run`; it keeps the part "prefix".
-        progress: see `run`; default none.
+        progress: see `run`.
 
     Returns:
         The state and the samples at the end of these stages, to be passed to `run` as `prefix`.
@@ -113,8 +114,9 @@ def prefix_of(experiment: Experiment, *, cache: ResultCache = no_cache, progress
         ValueError: as in `run`.
         RunFailedError: if the simulation broke down.
     """
+    require_kind("prefix_of", experiment, Experiment)
     common, _ = experiment.phases
-    runner = runner_of(experiment, progress=progress)
+    runner = runner_of(experiment, progress=callback(progress))
     runner.total_work = work_of(common, runner.state.replicas)
     return Prefix(runner, runner.run_cached(PREFIX, cache, *common), _key_of_prefix(experiment))
 

@@ -101,6 +101,6 @@ def view(pack: Pack | Frames) -> View:
     """
     if not isinstance(pack, Pack | Frames):
         kept = "gm.run(experiment, frames=10) keeps frames in recall.frames"
-        raise TypeError(f"gm.view takes a gm.Pack or frames, got a {type(pack).__name__}; {kept}")
+        raise TypeError(f"gm.view takes a gm.Pack or frames, got {type(pack).__name__}; {kept}")
     frames, name = (frames_of_pack(pack), pack.name) if isinstance(pack, Pack) else (pack, "frames")
     return View(page(name, figure("pack", frames), three=True, bare=True))

@@ -204,6 +204,7 @@ def test_every_number_that_is_asked_for_is_a_number_and_no_text_of_one() -> None
 EXPERIMENT_MADE = r"gm\.Experiment\(pack, gm\.six_signals\(\)\) makes one"
 TAKES_EXPERIMENT: dict[str, Callable[[Any], Any]] = {
     "run": gm.run,
+    "prefix_of": gm.prefix_of,
     "recall": gm.fidelity,
     "replace": functools.partial(gm.replace, gamma0=1e-3),
     "to_dict": gm.to_dict,
@@ -238,7 +239,7 @@ def test_what_is_not_of_the_kind_that_is_kept_or_drawn_is_refused(tmp_path: Path
         (gm.to_csv, (PACK,), r"to_csv takes a gm\.Recall, got a Pack"),
         (gm.to_xarray, (PACK,), r"to_xarray takes a gm\.Recall, got a Pack"),
         (gm.save_waveforms, (gm.six_signals(), path), r"takes a gm\.Signals, got '.*a\.h5'; as gm\.six_signals\(\)"),
-        (gm.view, (EXPERIMENT,), r"view takes a gm\.Pack or frames, got a Experiment; .*recall\.frames"),
+        (gm.view, (EXPERIMENT,), r"view takes a gm\.Pack or frames, got Experiment; .*recall\.frames"),
         (gm.prepare, (325,), r"prepare takes a gm\.Recipe, got 325; gm\.prepare\(grains=325\)"),
     ]
     for function, given, words in wrong:
