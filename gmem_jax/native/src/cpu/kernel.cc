@@ -1,5 +1,6 @@
-// The time step for one instruction set; compiled once for each, with GMEM_ISA the name of its namespace and the
-// compiler's flags, and again with GMEM_DERIVATIVES for its derivatives and with GMEM_SECOND_DERIVATIVES for theirs.
+// The time step for one instruction set. This file is compiled once for each set, with the compiler's flags for it, and
+// with GMEM_ISA as the name of its namespace. It is compiled again with GMEM_DERIVATIVES for derivatives of the steps,
+// and with GMEM_SECOND_DERIVATIVES for second derivatives.
 
 #include <cstdint>
 #include <cstdlib>
@@ -15,7 +16,7 @@
 namespace gmem {
 namespace GMEM_ISA {
 
-// Calls `function` with what does the work as a type in an `As`.
+// A type as an argument: `with_worker` calls `function` with an `As` of the `Engine` or `Adjoint` that does the work.
 template <class T>
 struct As {
   using type = T;
@@ -50,7 +51,7 @@ std::size_t scratch_bytes(const Problem& problem, const Block& block) {
   });
 }
 
-// Takes numbers too small for a full mantissa as zero, as XLA's own threads do: every thread must do the same.
+// Treats numbers too small for a full mantissa as zero, as XLA's own threads do: every thread must do the same.
 class FlushDenormals {
  public:
 #if defined(__SSE2__)

@@ -1,5 +1,5 @@
-// One replica: each vector is one number of W grains or of W contacts. What contacts look up is kept in rows of four
-// doubles besides. See `Engine` in block.h for how it is used.
+// The mode for one replica: each vector is one number of W grains or of W contacts. Numbers that contacts look up or
+// add to are also kept in rows of four doubles. See `Engine` in block.h for how it is used.
 
 #pragma once
 
@@ -24,11 +24,11 @@ template <class Law>
 struct PackedLayout {
   static constexpr int kHistoryRows = (Law::kHistory + 3) / 4;
 
-  Row* sphere;            // [S + 2]: centres; the last two are far apart and fill up vectors
+  Row* sphere;            // [S + 2]: centres; the last two are far apart: those of `dummy`
   GrainRows* grain;       // [N + 1]
   Row* remote;            // [remotes, 2]: sums of forces and torques
   Row* history;           // [candidates + 1, kHistoryRows]
-  RowOfSegment* segment;  // [Q, candidates + 1] of the Mindlin law: those that are few lie together
+  RowOfSegment* segment;  // [Q, candidates + 1] of the Mindlin law: segment k of all contacts lies together
   Marks<Law> marks;
 
   void place(const Problem& p, const Plan& plan, Arena& arena) {
@@ -59,8 +59,8 @@ struct Packed : PackedLayout<Law> {
   const Block& block;
   const Plan& plan;
   const ReplicaArrays& lane;
-  const Candidate dummy;  // which fills up vectors
-  V* hot;                 // the engine's
+  const Candidate dummy;  // fills up vectors where contacts are fewer than W
+  V* hot;                 // `Engine::hot`
 
   Packed(const Problem& problem, const Block& block)
       : problem(problem), block(block), plan(*block.pack->plan), lane(block.lanes[0]),
@@ -83,7 +83,7 @@ struct Packed : PackedLayout<Law> {
 
   // --- copying in and out
 
-  // Grain of lane l in unit u; the last vector is filled up with copies of the last grain, which nothing touches.
+  // Grain of lane l in unit u. The last vector is filled up with copies of the last grain, on which no contact acts.
   int grain_in(int u, int l) const { return u * W + l < problem.grains ? u * W + l : problem.grains - 1; }
 
   void load_unit(int u, V* hot, V* cold) const {
@@ -119,8 +119,8 @@ struct Packed : PackedLayout<Law> {
     lane.history_out[place.leaf][place.row * problem.stride] = number;
   }
 
-  // A number of the history in `row` of those that each grain of unit u has at walls; `place_at` has its place by the row of
-  // all.
+  // One number of a history at walls, for each grain of unit u. `row` counts the rows of one grain; `place_at` finds
+  // the place in the arrays of the call from the row among those of all grains.
   template <class PlaceAt>
   V wall_in(int u, int row, const PlaceAt& place_at) const {
     V a;
@@ -142,7 +142,7 @@ struct Packed : PackedLayout<Law> {
   }
 
   void mark_new(std::size_t c) const {
-    // What remembers something touches, or is found to have come apart like any other contact.
+    // A contact whose history is not 0 counts as touching. If it is apart, the first step finds that.
     bool any = false;
     for (int q = 0; q < Law::kGiven; ++q) any |= remembered(c, q) != 0.0;
     marks.touched[c] = any;
@@ -188,8 +188,8 @@ struct Packed : PackedLayout<Law> {
     Row f[W], t[W];
     for (int l = 0; l < W; ++l) {
       const int g = u * W + l;
-      // The lanes beyond the last grain are its copies without its contacts: the walls alone would throw them out, and
-      // their speed would make all candidates be looked at.
+      // Lanes beyond the last grain are copies of it without its contacts. No force acts on them: the walls alone would
+      // throw them out of the box, and by their speed (`Engine::travel`) all candidates would have to be looked at.
       f[l] = g < problem.grains ? grain[g].force : Row{};
       t[l] = g < problem.grains ? grain[g].torque : Row{};
       if (g >= problem.grains) continue;
@@ -217,9 +217,9 @@ struct Packed : PackedLayout<Law> {
 
   // --- contacts
 
-  static constexpr int kCached = 8192;  // candidates of a pack that stays in the cache by itself: some 700 grains
+  static constexpr int kCached = 8192;  // up to so many candidates, some 700 grains, nothing need be prefetched
 
-  // Of W contacts.
+  // Mindlin's segments of W contacts.
   struct Segments {
     RowOfSegment* first[W];
     int* stored[W];
@@ -250,7 +250,7 @@ struct Packed : PackedLayout<Law> {
   struct Group {
     int count;
     int c[W];
-    const Candidate* pair[W];  // where they lie: copies would be read before what was written of them has arrived
+    const Candidate* pair[W];  // pointers, since a read of a copy would wait until the copy has been written
   };
 
   void contacts(int first, int end, const V* parameter, const LawParameters<V>& law, double travel, Faces<V>& faces) {
@@ -262,7 +262,7 @@ struct Packed : PackedLayout<Law> {
       const int found = marks.find_near(look, end, travel, near);
       for (int n = 0; n < found; ++n) {
         const int c = near[n];
-        // Large packs are in no cache: ask in time for what does not lie in a row with what others want.
+        // Large packs are in no cache: prefetch the data of a later contact that do not lie next to those of others.
         if (asks && n + kAhead < found) {
           const std::size_t later = near[n + kAhead];
           const GrainRows* other = grain + plan.candidate[later].grain_other;
@@ -281,7 +281,7 @@ struct Packed : PackedLayout<Law> {
     compute(touching, count, parameter, law, faces);
   }
 
-  // By how many edges of a periodic box the second sphere of a candidate is moved, and how long these are.
+  // By how many edges of a periodic box the second sphere of a candidate is moved, and the lengths of the edges.
   const Row& image_of(std::size_t c) const { return reinterpret_cast<const Row&>(plan.image_of(c)); }
   static Row edges(const Cell<V>& cell) { return Row{cell.lengths.x[0], cell.lengths.y[0], cell.lengths.z[0]}; }
 
@@ -307,7 +307,7 @@ struct Packed : PackedLayout<Law> {
                : compute_in<false>(touching, count, parameter, law, faces);
   }
 
-  // ... in a box that has periodic axes or has not: GCC makes faster code of the two apart.
+  // `compute` in a box with or without periodic axes: GCC makes faster code of the two apart.
   template <bool periodic>
   __attribute__((noinline)) void compute_in(const int* touching, int count, const V* parameter,
                                             const LawParameters<V>& law, Faces<V>& faces) {
@@ -352,7 +352,7 @@ struct Packed : PackedLayout<Law> {
     through = {splat<V>(sum[0]), splat<V>(sum[1]), splat<V>(sum[2])};
   }
 
-  // Contacts that have come apart in this step: the laws give them no force and a blank history.
+  // Marks contacts that have come apart in this step. The laws give them no force and a blank history.
   void forget_apart(const Group& g, V overlap) {
     if (!bits_less(overlap, splat<V>(1e-300))) return;
     for (int l = 0; l < g.count; ++l)
@@ -369,7 +369,7 @@ struct Packed : PackedLayout<Law> {
     return g;
   }
 
-  // Of the images of the second grains, in a periodic box.
+  // The input of W contacts; in a periodic box, with the images of the second grains.
   template <bool periodic>
   GMEM_INLINE ContactInput<V> contact_input(const Group& g, const Cell<V>& cell) const {
     const auto one = [&](Row GrainRows::* row) {

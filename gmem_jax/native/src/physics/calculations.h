@@ -1,5 +1,6 @@
-// What reverse mode goes back through, as programs (numbers/program.h): a contact of each law, the two halves of a step of
-// a grain, and one of its spheres.
+// The calculations that reverse mode goes back through, as programs (numbers/program.h): a contact of each law, the two
+// halves of a grain's step, a sphere of a grain and its friction at a wall, the pressures, and the parameters.
+// The "bar" of a number is the derivative of the final result by it.
 
 #pragma once
 
@@ -10,7 +11,7 @@
 namespace gmem {
 namespace GMEM_ISA {
 
-// Rows of what is kept, and of the bars, of one grain: at the beginning of a step, the fields in order ...
+// Rows of one grain's numbers, and of their bars. At the beginning of a step: the fields in order.
 enum StateRow {
   kStatePosition = 0,
   kStateQuaternion = 3,
@@ -20,7 +21,7 @@ enum StateRow {
   kStateSpinRate = 16,
   kState = 19
 };
-// ... and midway, with the force and torque found there ...
+// Midway in a step: a `HalfStep`, and the force and torque found there.
 enum MidRow {
   kMidPosition = 0,
   kMidQuaternion = 3,
@@ -30,9 +31,9 @@ enum MidRow {
   kMidTorque = 16,
   kMid = 19
 };
-// ... or, instead of these, how it is turned.
+// Midway in a step, with the rotation matrix in the place of force and torque.
 enum TurnedRow { kTurnedRotation = 13, kTurned = 22 };
-// Rows of a contact's input; its history follows.
+// Numbers of a `ContactInput`; the contact's history follows them.
 constexpr int kInputs = 18;
 
 // Calls `each` for all numbers of a structure, in order.
@@ -95,7 +96,7 @@ constexpr void for_numbers(Cell<V>& a, const Each& each) {
 }
 constexpr int kCellNumbers = 9;
 
-// To and from arrays of them.
+// Copy the numbers of a structure to an array, and from an array.
 template <class V, class T>
 inline void store_numbers(V* to, T a) {
   for_numbers(a, [&](V number) { *to++ = number; });
@@ -120,7 +121,7 @@ constexpr void results(Program& program, T a) {
   for_numbers(a, [&](const Symbol& number) { result(program, number); });
 }
 
-// Mindlin's rings where no lane comes to another one.
+// Mindlin's segments of a contact whose outermost ring stays the same in all lanes.
 struct SameRings {
   Symbol end;
 
@@ -128,17 +129,17 @@ struct SameRings {
 };
 constexpr void reattach(SameRings&, Layers<Symbol>&, Symbol, Symbol, double) {}
 
-// What is constant of one contact, where boxes are periodic or spheres differ: see `Image` and `Radii`.
+// The constants of one contact, where boxes are periodic or spheres differ in radius: see `Image` and `Radii`.
 enum ContactConstant { kImage = 0, kReach = 3, kLean, kRoot, kContactConstants };
-// ... and of one grain, and of one of its spheres.
+// The constants of one grain, of one of its spheres, and of that sphere at a plane.
 enum GrainConstant { kCube = 0, kInverseCube, kInverseFifth, kGrainConstants };
 enum SphereConstant { kSize = 0, kRadius, kSphereConstants, kNormal = kSphereConstants, kPlaneConstants = kNormal + 3 };
 
-// Calculations are `general` where boxes are periodic or spheres differ. A `Cell` is without effect otherwise, as
-// are constants of equal spheres.
+// Calculations are `general` where boxes are periodic or spheres differ in radius. If only one of the two holds, the
+// numbers of the other have no effect.
 
-// Arrays: the contact's input and history; the parameters; those of the law; number `last` of `Reach`; if general, the
-// cell, and what is constant of the contact.
+// Arrays: the contact's input and history; the parameters; `LawParameters`; the ring number `last` of `Reach`; if
+// general, the cell and the constants of the contact.
 // Results: `ContactLoads`; the history; if general, the force through the faces of the cell.
 template <class Law, bool general = false>
 struct OneContact {
@@ -177,8 +178,8 @@ struct OneContact {
   }
 };
 
-// Arrays: the grain's numbers; those of `GrainParameters`; if general, the cell before and at the end of the step.
-// Results: midway, and how it is turned.
+// Arrays: the grain's numbers; `GrainParameters`; if general, the cell before the step and at its end.
+// Results: the grain midway, and its rotation matrix.
 template <bool general = false>
 struct StepBegin {
   static constexpr Program record() {
@@ -198,9 +199,9 @@ struct StepBegin {
   }
 };
 
-// Arrays: the grain's numbers midway, with force and torque; those of `GrainParameters`; if general, the cell, the mass of
-// a grain of size 1, what is constant of the grain, and what of the force is friction of walls. Results: at the end; if
-// general, what it adds to `section`.
+// Arrays: the grain's numbers midway, with force and torque; `GrainParameters`; if general, the cell, the mass of a
+// grain of size 1, the constants of the grain, and the part of the force that is friction of walls.
+// Results: the grain at the end of the step; if general, its `section`.
 template <bool isotropic, bool general = false>
 struct StepEnd {
   static constexpr Program record() {
@@ -225,7 +226,7 @@ struct StepEnd {
   }
 };
 
-// What the constants of a sphere, array 4, make of where it is and of how stiff walls are to it; its radius.
+// Scales a sphere's place in the grain and the wall stiffness by the sphere's constants, array 4. Returns its radius.
 constexpr Symbol scale(Program& program, Vec<Symbol>& body, GrainParameters<Symbol>& parameters) {
   const Symbol radius = input(program, 4, kRadius, Bar::none);
   body = input(program, 4, kSize, Bar::none) * body;
@@ -233,9 +234,9 @@ constexpr Symbol scale(Program& program, Vec<Symbol>& body, GrainParameters<Symb
   return radius;
 }
 
-// Arrays: the grain's numbers midway, and how it is turned; those of `GrainParameters`; where the sphere is in the grain;
-// the walls; if general, what is constant of the sphere. Results: its centre; force, torque, and the forces on lower and
-// upper walls.
+// Arrays: the grain's numbers midway, and its rotation matrix; `GrainParameters`; the sphere's place in the grain; the
+// walls; if general, the constants of the sphere.
+// Results: the sphere's centre; if walls are `near`, force, torque, and the forces on lower and upper walls.
 template <bool near, bool general = false>
 struct OneSphere {
   static constexpr int kResults = 15;
@@ -256,7 +257,7 @@ struct OneSphere {
   }
 };
 
-// Arrays: the walls; the sum of the forces on the two of each axis. Results: the pressures.
+// Arrays: the walls; the sum of the forces on the two walls of each axis. Results: the pressures.
 struct WallPressure {
   static constexpr Program record() {
     Program program;
@@ -278,8 +279,8 @@ struct ParameterNumbers {
   }
 };
 
-// Friction of a plane of the walls on a sphere, as a force and a torque on its grain. `at` and `moves` are place and velocity
-// of the plane, `side` is -1 for a lower and 1 for an upper one, and `normal` leads to it.
+// Friction of a plane of the walls on a sphere, as a force and a torque on its grain. `at` and `moves` are position and
+// velocity of the plane, and `normal` points to it; so `side` is -1 for a lower plane and 1 for an upper one.
 template <class Law, class V, class SegmentsOf>
 constexpr WallFriction<V> rub_plane(const HalfStep<V>& half, const Matrix<V>& rotation, Vec<V> body, V radius,
                                     V stiffness, V damping_time, V at, V moves, Vec<V> normal, const WallLaw<V>& walls,
@@ -296,9 +297,9 @@ constexpr WallFriction<V> rub_plane(const HalfStep<V>& half, const Matrix<V>& ro
   return {contact.force, cross(contact.lever_one, contact.force)};
 }
 
-// Arrays: as of `OneSphere` if general, but of the walls the plane's place and, `kPlanes` on, its velocity, and the constants
-// with the normal of the plane; then the history of the sphere at it; those of `WallLaw`; and number `last` of `Reach`.
-// Results: force and torque by friction of the wall, and the history.
+// Arrays: those of a general `OneSphere`, but instead of the walls the plane's position and, `kPlanes` further on, its
+// velocity; the normal of the plane follows the constants. Then the history of the sphere at the plane; `WallLaw`; and
+// the ring number `last` of `Reach`. Results: force and torque by friction of the wall, and the history.
 template <class Law>
 struct OnePlane {
   static constexpr int kResults = 6 + Law::kHistory;

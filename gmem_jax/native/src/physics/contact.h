@@ -16,22 +16,22 @@ struct ContactInput {
   Vec<V> spin_one, spin_other;
 };
 
-// What is to be known of a contact where spheres differ in radius.
+// The numbers of a contact that depend on its radii, where spheres differ in radius.
 // gmem_jax/physics/contact/kinematics.py: Unequal
 template <class V>
 struct Unequal {
-  V reach, lean, root;  // as of `Radii` in cpu/problem.h
+  V reach, lean, root;  // as in `Radii` of cpu/problem.h
 };
 
-// What the strain of a periodic box (`Cell` of motion.h) adds to the velocity of the second grain, or of its image. Levers are
-// those of that one.
+// Adds the velocity that the strain of a periodic box (`Cell` of motion.h) gives to the second grain, or to its image.
+// `lever_other` begins at the centre of that grain or image.
 template <class V, class Cell>
 constexpr GMEM_INLINE void drift(ContactInput<V>& m, const Cell& cell) {
   m.velocity = m.velocity + cell.flow(m.lever_one - m.lever_other);
 }
 
-// From the second grain to its image in a periodic box (`Cell` of motion.h), which `shift` leads to. Levers already end
-// at the contact with that.
+// Puts the image of the second grain in a periodic box (`Cell` of motion.h) in the place of the grain; `shift` leads
+// from the grain to the image. The levers already end at the contact with the image.
 // gmem_jax/physics/forces.py: relative_motion
 template <class V, class Cell>
 constexpr GMEM_INLINE void to_image(ContactInput<V>& m, Vec<V> shift, const Cell& cell) {
@@ -39,8 +39,8 @@ constexpr GMEM_INLINE void to_image(ContactInput<V>& m, Vec<V> shift, const Cell
   drift(m, cell);
 }
 
-// ... of a contact whose separation and levers are still those of the second grain itself; `image` is how many edges lead to
-// its image along each axis.
+// The same for a contact whose separation and levers are still those of the second grain itself. `image` is the number
+// of edges of the box from the grain to its image, along each axis.
 template <class V, class Cell>
 constexpr void move_to_image(ContactInput<V>& m, Vec<V> image, const Cell& cell) {
   const Vec<V> shift = cell.shift(image), half = splat<V>(0.5) * shift;
@@ -50,13 +50,13 @@ constexpr void move_to_image(ContactInput<V>& m, Vec<V> image, const Cell& cell)
   to_image(m, shift, cell);
 }
 
-// What the force on the first grain of a contact adds to that through the faces of a periodic box.
+// A contact's part of the force through the faces of a periodic box; `force` acts on the first grain of the contact.
 template <class V>
 constexpr GMEM_INLINE Vec<V> through_faces(Vec<V> image, Vec<V> force) {
   return {-(image.x * force.x), -(image.y * force.y), -(image.z * force.z)};
 }
 
-// Levers and relative motion, unprojected. The first part of
+// Levers and relative motion before its projection. The first part of
 // gmem_jax/physics/contact/kinematics.py: kinematics
 template <class V>
 constexpr GMEM_INLINE void relative_motion(const ContactInput<V>& m, V square, Contact<V>& c) {
@@ -68,14 +68,14 @@ constexpr GMEM_INLINE void relative_motion(const ContactInput<V>& m, V square, C
   c.spin_sum = m.spin_one + m.spin_other;
 }
 
-// From the square of the distance and the inverse distance.
+// The overlap of spheres of radius 1, from the square of their distance and the inverse distance.
 template <class V>
 constexpr GMEM_INLINE V overlap_of(const Contact<V>& c) {
   return fnma(c.square, c.inverse, splat<V>(2.0));
 }
 
-// From the motion of a contact halfway between the spheres to that of one that is not. Its normal is known, and `spin`, by how
-// much the second grain spins faster.
+// Moves the contact point by `lean` along the normal, away from the place halfway between the spheres. `spin` is the
+// spin of the second grain minus that of the first.
 template <class V>
 constexpr GMEM_INLINE void lean_over(Vec<V> spin, V lean, Contact<V>& c) {
   const Vec<V> moved = lean * c.normal;
@@ -84,7 +84,7 @@ constexpr GMEM_INLINE void lean_over(Vec<V> spin, V lean, Contact<V>& c) {
   c.sliding = add_cross(c.sliding, spin, moved);
 }
 
-// ... where that motion is not found yet either.
+// The same for a contact whose motion halfway between the spheres has not been computed.
 template <class V>
 constexpr GMEM_INLINE void lean_over(ContactInput<V> m, V lean, Contact<V>& c) {
   m.separation = c.normal;
@@ -92,15 +92,16 @@ constexpr GMEM_INLINE void lean_over(ContactInput<V> m, V lean, Contact<V>& c) {
   lean_over(m.spin_other - m.spin_one, lean, c);
 }
 
-// Of contacts halfway between the spheres, whose motion is known from the beginning.
+// The `motion_of` of contacts halfway between the spheres, whose motion is complete.
 struct Halfway {
   constexpr void operator()(int) const {}
 };
 
-// From what `relative_motion` left to normals, sliding velocities and normal forces. The second part of
+// Finds normals, sliding velocities and normal forces after `relative_motion`. The second part of
 // gmem_jax/physics/contact/kinematics.py: kinematics
-// Where spheres differ in radius, `lean_over` has what `motion_of(n)` returns; there need only be separations and squares
-// before, if that is a `ContactInput`. Roots of overlaps and forces are still those of a harmonic mean of 1: see `rub`.
+// Where spheres differ in radius, `motion_of(n)` returns the first argument of `lean_over`. If that is a
+// `ContactInput`, contacts need only have separations and squares before. Roots of overlaps and forces are those of
+// radii whose harmonic mean is 1; `rub` corrects them.
 template <bool differ = false, class V, class MotionOf = Halfway>
 constexpr void close(Contact<V>* c, int count, const V* parameter, const Unequal<V>* unequal = nullptr,
                      const MotionOf& motion_of = {}) {
@@ -129,8 +130,8 @@ constexpr void close(Contact<V>* c, int count, const V* parameter, const Unequal
   }
 }
 
-// The tangential forces of a batch, of which `close` found the rest. Between spheres whose radii have a harmonic mean r all
-// forces are root(r) times those of spheres of radius 1, but for tangential springs that do not depend on the overlap.
+// Finds the tangential forces of a batch after `close`. Between spheres whose radii have the harmonic mean r all forces
+// are root(r) times those of spheres of radius 1, except those of tangential springs that do not depend on the overlap.
 template <class Law, class V, class SegmentsOf>
 constexpr GMEM_INLINE void rub(Contact<V>* c, int count, const LawParameters<V>& law, const Unequal<V>* unequal,
                                const SegmentsOf& segments_of) {

@@ -9,23 +9,23 @@
 namespace gmem {
 namespace GMEM_ISA {
 
-// A contact under way. Its computation is cut into passes over a batch of contacts that fits into the nearest cache:
-// taken alone, a contact is a long chain of operations that wait for each other, more than the processor can look
-// ahead; in a pass it meets many short ones.
+// A contact while it is computed. The computation is cut into passes over a batch of contacts that fits into the
+// nearest cache. One contact alone is a chain of operations that wait for each other, longer than the processor can
+// look ahead. A pass has many short chains, which the processor overlaps.
 template <class V>
 struct Contact {
-  Vec<V> normal;                  // from i to j; the separation of the centres at first
-  Vec<V> sliding;                 // relative velocity of the surfaces in the tangent plane; all of it at first
+  Vec<V> normal;                  // from i to j; before `close`, the separation of the centres
+  Vec<V> sliding;                 // relative velocity of the surfaces in the tangent plane; before `close`, all of it
   Vec<V> lever_one, lever_other;  // from the grains' centres to the contact point
   Vec<V> spin_sum;
   Vec<V> force;    // tangential, on i
-  V overlap;       // negative where apart
-  V root_overlap;  // of 1 where apart
+  V overlap;       // negative where the spheres are apart
+  V root_overlap;  // its square root; 1 where the spheres are apart
   V normal_force;
   V turned;  // half the angle by which the contact turns about its normal in this step
   V square;  // of the length to be inverted next
   V inverse;
-  V before;  // square of the force before it was flattened
+  V before;  // square of the force before its projection on the tangent plane
   V* history;
 
   constexpr Mask<V> touching() const { return overlap > V{}; }
@@ -38,8 +38,8 @@ constexpr void invert_roots(Contact<V>* c, int count) {
   for (int n = 0; n < count; ++n) c[n].inverse = inverse_root(c[n].square);
 }
 
-// Where number `q` of the history in `row` of the list lies in the arrays of a call: leaf 0 is the force, leaf 1 the
-// overlap; Mindlin's layers come before them.
+// Where number `q` of the history in row `row` lies in the arrays of a call. Leaf 0 is the vector of the history, leaf
+// 1 the overlap. In Mindlin's law leaf 0 is the layers, and the numbers of the others are one higher.
 struct Place {
   int leaf;
   long long row;
@@ -54,7 +54,7 @@ inline Place place_of(long long row, int q) {
 template <class V>
 struct LawParameters {
   V mu, spacing, inverse_spacing;
-  V growth;   // stiffness times dt: what a step of sliding adds to an elastic force
+  V growth;   // stiffness times dt: sliding at velocity v adds v times this to an elastic force in a step
   V dashpot;  // stiffness times damping time
 
   LawParameters() = default;
@@ -72,8 +72,8 @@ constexpr GMEM_INLINE V hertz(Mask<V> touching, V overlap, V root_overlap, V clo
   return zero_unless(touching & (force > V{}), force);
 }
 
-// How a tangential force is carried along in this step: projected on the tangent plane with its magnitude restored,
-// and turned about the normal by the Cayley map, whose denominator is restored with the magnitude.
+// How a tangential force is carried along with its contact in a step. It is projected on the tangent plane, and turned
+// about the normal by the Cayley map. One factor restores the magnitude and divides by the denominator of that map.
 // gmem_jax/physics/contact/kinematics.py: transport
 template <class V>
 struct Transport {
@@ -87,7 +87,7 @@ struct Transport {
     denominator2 = denominator * denominator;
   }
 
-  // First part: flattens `force`; returns the square whose inverse root the second part wants.
+  // First part: projects `force` on the tangent plane. Returns the square whose inverse root `restore` needs.
   constexpr GMEM_INLINE V flatten(Vec<V>& force, V& before) const {
     const V along_normal = dot(force, normal);
     before = dot(force, force);
@@ -101,7 +101,7 @@ struct Transport {
   }
 };
 
-// Carry vectors of a batch, `from(contact)`, along with their contacts; their forces become `then(contact, carried)`.
+// Carries the vector `from(contact)` along with each contact of a batch; its force becomes `then(contact, carried)`.
 template <class V, class From, class Then>
 constexpr void carry(Contact<V>* c, int count, const From& from, const Then& then) {
   for (int n = 0; n < count; ++n) {
@@ -121,8 +121,8 @@ struct Remembered {
   }
 };
 
-// By what a trial force is to be multiplied, of which `square` is the square. Most contacts stick, and need no root; a GPU,
-// which takes one contact at a time, has too few registers for the question.
+// The factor that takes a trial force, whose square is `c.square`, back to the friction limit. Most contacts stick, and
+// need no root. A GPU, which computes one contact at a time, always takes the root: it lacks registers for the branch.
 // gmem_jax/physics/contact/friction.py: coulomb
 template <class V>
 constexpr GMEM_INLINE V limited(Contact<V>& c, V mu) {
@@ -161,7 +161,7 @@ constexpr GMEM_INLINE void friction(Hooke, Contact<V>* c, int count, const LawPa
 template <class V>
 constexpr GMEM_INLINE void friction(Rescaled, Contact<V>* c, int count, const LawParameters<V>& law) {
   const V one = splat<V>(1.0), push = law.growth + law.dashpot;
-  // sqrt(p / p_old) on unloading; sqrt(p) has been left in `root_overlap`.
+  // Unloading multiplies the force by sqrt(p / p_old). `close` left sqrt(p) in `root_overlap`.
   carry(c, count, Remembered{}, [&](const Contact<V>& now, Vec<V> carried) {
     const V last = now.history[kLastOverlap];
     const Mask<V> unloads = now.touching() & (now.overlap < last);
@@ -176,14 +176,14 @@ constexpr GMEM_INLINE void friction(Rescaled, Contact<V>* c, int count, const La
   }
 }
 
-// Where a contact stands in its rings: `x` of them reached, the outermost, number `outer`, in part; -1 where none is
-// attached.
+// How far a contact has come in Mindlin's rings: its radius `x` = sqrt(overlap) / spacing, in rings, and the number
+// `outer` of the outermost ring that it has reached, which is attached in part; -1 where no ring is attached.
 // gmem_jax/physics/contact/mindlin.py: Mindlin.outermost
 template <class V, Variant variant>
 struct Reach {
   V x, outer;
 
-  // Rings number `last` and beyond are one.
+  // All rings from number `last` on are one ring.
   constexpr Reach(V overlap, const LawParameters<V>& law, V last)
       : x(root(zero_unless(overlap > V{}, overlap)) * law.inverse_spacing) {
     const V begin = splat<V>(variant == Variant::paper ? 0.5 : 0.0);
@@ -192,7 +192,7 @@ struct Reach {
   }
 };
 
-// By how much ring 0 weighs less than one.
+// How much less than 1 ring 0 weighs.
 template <Variant variant>
 constexpr double kLacking = variant == Variant::paper ? 0.5 : 0.0;
 
@@ -205,8 +205,9 @@ constexpr GMEM_INLINE Vec<V> any_tangent(Vec<V> normal) {
   return {select(near_x, V{}, one), zero_unless(near_x, one), V{}};
 }
 
-// `segments_of(n)` are those of contact n: with `last()`, see `Reach`; `count()`, of the lane that has most; `get(k)` and
-// `set(k, run)`; `keep(counts)`, of each lane; and `remember()`, called before they change.
+// `segments_of(n)` are the segments of contact n (segments.h). They have `last()`, see `Reach`; `count()`, the number
+// in the lane that has most; `get(k)` and `set(k, segment)`; `keep(counts)`, which sets the number in each lane; and
+// `remember()`, which is called before segments change.
 // gmem_jax/physics/contact/mindlin.py: Mindlin.__call__
 template <class V, Variant variant, class SegmentsOf>
 constexpr GMEM_INLINE void friction(Layered<variant>, Contact<V>* c, int count, const LawParameters<V>& law,
@@ -218,14 +219,14 @@ constexpr GMEM_INLINE void friction(Layered<variant>, Contact<V>* c, int count, 
   carry(c, count, frame, [](const Contact<V>&, Vec<V> carried) { return carried; });
 
   Flat<V> sliding[kTogether], trial[kTogether];
-  V weight[kTogether], total[kTogether];  // of the rings inside the outermost; of all
+  V weight[kTogether], total[kTogether];  // of the rings inside the outermost; of all rings
   Mask<V> attached[kTogether];
   for (int n = 0; n < count; ++n) {
     auto segments = segments_of(n);
     const V last = segments.last();
     const Reach<V, variant> before(c[n].history[kLastOverlap], law, last), now(c[n].overlap, law, last);
     Layers<V> layers = load_layers(c[n].history + kLayers);
-    if (variant == Variant::averaged) {  // the force in a ring that fills stays: Mindlin._diluted
+    if (variant == Variant::averaged) {  // a ring that fills keeps its force, so its f shrinks: Mindlin._diluted
       const V filled = before.x - before.outer, fills = select(before.outer < now.outer, one, now.x - before.outer);
       const Mask<V> grows = filled < fills;
       layers.rim = select(grows, filled / select(grows, fills, one), one) * layers.rim;

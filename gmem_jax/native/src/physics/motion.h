@@ -13,8 +13,8 @@ struct WallState {
   Vec<V> lower, upper, lower_velocity, upper_velocity;
 };
 
-// A box of which some axes are periodic: bit `axis` of `periodic`. Along the others there is nothing of it: rate and lower
-// are 0, lengths 1.
+// A box that is periodic along the axes whose bits are set in `periodic`. Along the others `rate` and `lower` are 0,
+// and `lengths` are 1.
 // gmem_jax/physics/step.py: _carried
 // gmem_jax/physics/forces.py: strain_rate
 template <class V>
@@ -33,13 +33,13 @@ struct Cell {
     return c;
   }
 
-  // From one image of a place to another.
+  // The vector from a place to its image, which is `image` edges away.
   constexpr Vec<V> shift(Vec<V> image) const { return {image.x * lengths.x, image.y * lengths.y, image.z * lengths.z}; }
   constexpr Vec<V> shift(double x, double y, double z) const { return shift({splat<V>(x), splat<V>(y), splat<V>(z)}); }
   constexpr Vec<V> flow(Vec<V> apart) const { return {rate.x * apart.x, rate.y * apart.y, rate.z * apart.z}; }
 };
 
-// The walls without those of periodic axes, which nothing touches.
+// The walls, with those of periodic axes so far away that nothing touches them.
 template <class V>
 constexpr WallState<V> without(int periodic, WallState<V> w) {
   const V far = splat<V>(1e300);
@@ -57,7 +57,7 @@ struct Grain {
   Vec<V> velocity, spin, acceleration, spin_rate;
 };
 
-// ... with position and orientation at its end, and velocities of its middle.
+// A grain midway in a step: position and orientation at the end of the step, velocity and spin in its middle.
 template <class V>
 struct HalfStep {
   Vec<V> position;
@@ -65,7 +65,7 @@ struct HalfStep {
   Vec<V> velocity, spin;
 };
 
-// A grain's constants, of the parameter array.
+// A grain's constants, from the parameter array.
 template <class V>
 struct GrainParameters {
   V dt, half_dt, drag, slowed, inertia[3], inverse_mass, inverse_inertia[3], wall_stiffness, normal_damping, gravity;
@@ -92,7 +92,8 @@ constexpr GMEM_INLINE HalfStep<V> begin_step(const GrainParameters<V>& p, const 
   return {fma(p.dt, velocity, g.position), turn(g.orientation, p.dt * spin), velocity, spin};
 }
 
-// ... where a periodic box goes from `before` to `cell`: grains keep their places in it, and move beside that.
+// The same in a periodic box that goes from `before` to `cell`, and carries its grains along. Velocities are relative
+// to the box.
 template <class V>
 constexpr GMEM_INLINE HalfStep<V> begin_step(const GrainParameters<V>& p, const Grain<V>& g, const Cell<V>& before,
                                              const Cell<V>& cell) {
@@ -123,8 +124,8 @@ constexpr Vec<V> angular_acceleration(const GrainParameters<V>& p, bool isotropi
   return rotation * rate(fma(p.half_dt, rate(body_spin), body_spin));
 }
 
-// Second half: accelerations and velocities; position and orientation stay. A grain of another size is moved by a force and a
-// torque as one of size 1 is by that force over the third, and that torque over the fifth power of its size.
+// Second half: accelerations and velocities; position and orientation stay. For a grain of another size than 1 the
+// caller divides the force by the third power of the size, and the torque by the fifth.
 // gmem_jax/physics/grain.py: Clump.scaled
 // gmem_jax/physics/step.py: step (from the forces on)
 template <class V>
@@ -139,7 +140,7 @@ constexpr GMEM_INLINE Grain<V> end_step(const GrainParameters<V>& p, bool isotro
           acceleration, spin_rate};
 }
 
-// ... where velocities are those beside the strain of a periodic box.
+// The same in a periodic box, where velocities are relative to its strain.
 template <class V>
 constexpr GMEM_INLINE Grain<V> end_step(const GrainParameters<V>& p, bool isotropic, const HalfStep<V>& m, Vec<V> force,
                                         Vec<V> torque, const Cell<V>& cell) {
@@ -181,7 +182,7 @@ constexpr Vec<V> wall_force(const GrainParameters<V>& parameters, Vec<V> overlap
   return {axis(overlap.x, closing.x), axis(overlap.y, closing.y), axis(overlap.z, closing.z)};
 }
 
-// Adds to `on` the forces of the walls on one sphere of a grain, of a radius for which the walls have their stiffness.
+// Adds to `on` the forces of the walls on one sphere of a grain. The wall stiffness in `p` holds for `radius`.
 // gmem_jax/physics/forces.py: forces_on_grains
 template <class V>
 constexpr void touch_walls(const GrainParameters<V>& p, Vec<V> centre, Vec<V> lever, Vec<V> velocity,
@@ -197,14 +198,15 @@ constexpr void touch_walls(const GrainParameters<V>& p, Vec<V> centre, Vec<V> le
   on.torque = add_cross(on.torque, lever, low - up);
 }
 
-// What friction of the walls does to a grain.
+// Force and torque on a grain by friction of the walls.
 template <class V>
 struct WallFriction {
   Vec<V> force, torque;
 };
 
-// The law of the contacts at walls, and what it needs beside that. They are contacts whose radii have another harmonic mean:
-// `stiffer`, its root, is by how much walls are stiffer than spheres of radius 1. See `rub`.
+// The friction law at walls, and the other parameters that contacts with walls need. `rub` treats these as contacts
+// between unequal spheres: the root of the harmonic mean is the factor by which the wall is stiffer than a contact
+// between spheres of radius 1 (`stiffer`).
 template <class V>
 struct WallLaw {
   LawParameters<V> law;
@@ -219,7 +221,7 @@ struct WallLaw {
   }
 };
 
-// A sphere's contact with a plane that is along `normal`, but for its friction and its history.
+// A sphere's contact with the plane that lies in the direction `normal`, without its friction and its history.
 // gmem_jax/physics/contact/wall.py: wall_kinematics
 template <class V>
 constexpr GMEM_INLINE void meet_plane(Vec<V> normal, const WallLaw<V>& walls, V damping_time, Vec<V> lever,
@@ -235,16 +237,17 @@ constexpr GMEM_INLINE void meet_plane(Vec<V> normal, const WallLaw<V>& walls, V 
   now.normal_force = hertz(now.touching(), safe, now.root_overlap, closing, walls.normal_stiffness, damping_time);
 }
 
-// From the centre of the box to plane w.
+// The unit vector from the centre of the box to plane w.
 template <class V>
 constexpr Vec<V> normal_of_plane(int w) {
   const V zero{}, side = splat<V>(w < 3 ? -1.0 : 1.0);
   return {w % 3 == 0 ? side : zero, w % 3 == 1 ? side : zero, w % 3 == 2 ? side : zero};
 }
 
-// Adds to `on` the friction of the walls on one sphere of a grain, of a radius for which the walls have their stiffness.
-// `history` has what the law remembers of it at each plane, [kPlanes, Law::kHistory], and `segments_of(w)` Mindlin's
-// segments at plane w; is that anything but 0, the plane's bit of `remembered` is set. Returns these bits afterwards.
+// Adds to `on` the friction of the walls on one sphere of a grain. The wall stiffness in `p` is that for the sphere's
+// radius. `history` is the sphere's history at each plane, [kPlanes, Law::kHistory]; `segments_of(w)` are Mindlin's
+// segments at plane w. Bit w of `remembered` is set where the history at plane w may differ from 0. Returns the new
+// bits: the planes that the sphere touches.
 // gmem_jax/physics/contact/wall.py: wall_friction
 template <class Law, class V, class SegmentsOf>
 GMEM_INLINE unsigned rub_walls(const GrainParameters<V>& p, const WallLaw<V>& walls, Vec<V> centre, Vec<V> lever,
@@ -287,7 +290,7 @@ GMEM_INLINE unsigned rub_walls(const GrainParameters<V>& p, const WallLaw<V>& wa
   return touched;
 }
 
-// The centre of a sphere of a grain, and what the walls do to it if they are near.
+// The centre of a sphere of a grain. If the walls are `near`, adds their forces on the sphere to `on`.
 template <class V>
 constexpr GMEM_INLINE Vec<V> sphere_of(const GrainParameters<V>& p, const HalfStep<V>& m, const Matrix<V>& rotation,
                                        Vec<V> body, bool near, const WallState<V>& box, WallForces<V>& on,
@@ -307,7 +310,8 @@ constexpr GMEM_INLINE Vec<V> body_at(const Number* at) {
   }
 }
 
-// Finds the spheres of a grain, handed to `put(k, centre)`, and what the walls do to them; whether they are near them.
+// Calls `put(k, centre)` for the spheres of a grain, adds the walls' forces to `on`, and returns whether walls are
+// near.
 // gmem_jax/physics/forces.py: sphere_table
 template <class V, class Number, class Put>
 GMEM_INLINE bool spheres_of(const GrainParameters<V>& p, const HalfStep<V>& m, const Number* offsets, int spheres,
@@ -320,7 +324,7 @@ GMEM_INLINE bool spheres_of(const GrainParameters<V>& p, const HalfStep<V>& m, c
   return near;
 }
 
-// ... of a grain of some size, whose spheres have `radii` where it is 1 and are then within `outer` of its centre.
+// The same for a grain of size `size`. In one of size 1 the spheres have `radii`, and lie within `outer` of its centre.
 template <class V, class Number, class Put>
 GMEM_INLINE bool spheres_of(const GrainParameters<V>& p, const HalfStep<V>& m, const Number* offsets,
                             const double* radii, int spheres, V size, double outer, const WallState<V>& box,
@@ -341,7 +345,7 @@ GMEM_INLINE bool spheres_of(const GrainParameters<V>& p, const HalfStep<V>& m, c
   return near;
 }
 
-// What a grain adds to L times the force across a section of a periodic box.
+// A grain's part of L times the force across a section of a periodic box, along each axis; L is the box's length.
 // gmem_jax/physics/forces.py: section_force
 template <class V>
 constexpr Vec<V> section(const Cell<V>& cell, V mass, const HalfStep<V>& m, Vec<V> force) {
@@ -363,7 +367,7 @@ constexpr Vec<V> pressure(const WallState<V>& box, Vec<V> force) {
           force.z / (two * (lengths.x * lengths.y))};
 }
 
-// Pressures along the periodic axes: of what the grains of a box add, and of the forces through its faces.
+// Pressures along the periodic axes, from the sum of `section` over all grains and the forces through the box's faces.
 template <class V>
 constexpr Vec<V> section_pressure(int periodic, const WallState<V>& box, const Cell<V>& cell, Vec<V> sections,
                                   Vec<V> through) {

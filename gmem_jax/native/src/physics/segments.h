@@ -1,7 +1,7 @@
-// What is stored of Mindlin's f. All attached rings are changed alike in every step: what all have got is kept once, and
-// only the outermost ring, which is filling, by itself. The rings inside are looked at when a contact reaches a ring more
-// or less. Those that were attached together share their f for ever: kept are segments of equal rings. (A contact of the
-// shipped packs has 37 rings in 2 segments at rest, and 52 in 22 where it is compressed.)
+// How Mindlin's f is stored. A step adds the same to f in all attached rings, so this common part is kept once. f of
+// the outermost ring, which is being filled, is kept by itself. The rings inside it are looked at only when a contact
+// reaches one ring more or less. Rings that were attached together have the same f for ever, so they are kept as
+// segments of equal rings. (A contact of the shipped packs has 37 rings in 2 segments at rest, 52 in 22 if compressed.)
 
 #pragma once
 
@@ -10,14 +10,14 @@
 namespace gmem {
 namespace GMEM_ISA {
 
-// Every lane has its own segments: number k of one may begin elsewhere than number k of another.
+// Every lane has its own segments: segment k of one lane may begin at another ring than segment k of another lane.
 template <class V>
 struct Segment {
-  Flat<V> force;  // f without what is common to all
-  V start;        // its first ring; it ends where the next one begins, the last at the outermost ring
+  Flat<V> force;  // f without `Layers::common`
+  V start;        // its first ring; it ends where the next segment begins, and the last one at the outermost ring
 };
 
-// Where a segment begins that a lane does not have: beyond all rings.
+// The start of a segment that a lane does not have: beyond all rings.
 constexpr double kNowhere = 1e9;
 
 template <class V>
@@ -32,12 +32,12 @@ inline void copy_lane(Segment<V>& to, int l, const Segment<V>& from) {
   copy_lane(to.start, l, from.start);
 }
 
-// Of all rings of a contact.
+// The numbers of a contact's rings that change in every step.
 template <class V>
 struct Layers {
-  Flat<V> common;  // what is to be added to the f of every segment
+  Flat<V> common;  // to be added to f of every segment
   Flat<V> inside;  // the sum of w f over the rings inside the outermost
-  Flat<V> rim;     // f of the outermost
+  Flat<V> rim;     // f of the outermost ring
 };
 
 template <class V>
@@ -51,8 +51,9 @@ constexpr void store_layers(V* p, const Layers<V>& a) {
   p[4] = a.rim.along, p[5] = a.rim.across;
 }
 
-// The layers of a contact whose outermost ring was `before` (-1: none is attached) and is `outer` now, in the lanes where
-// that differs: rings that it left are forgotten, new ones begin with nothing. Ring 0 weighs less than one by `lacking`.
+// Changes segments and layers of a contact from the outermost ring `before` (-1: none is attached) to `outer`, in the
+// lanes where the two differ. Rings that the contact left are forgotten; new rings begin with f = 0. The weight of ring
+// 0 is 1 - `lacking`.
 template <class V, class Segments>
 void reattach(Segments& segments, Layers<V>& layers, V before, V outer, double lacking) {
   segments.remember();
@@ -68,7 +69,7 @@ void reattach(Segments& segments, Layers<V>& layers, V before, V outer, double l
     const Mask<V> stays = segment.start < outer, reaches = segment.start <= outer,
                   begins = grows & (outer <= segment.start);
     rim = select(shrinks & reaches, segment.force, rim);
-    // First the ring that was the outermost, then those that were passed in this step.
+    // New segments are the ring that was the outermost, then the rings that were passed in this step.
     const Mask<V> former = begins & (last < before);
     const Mask<V> passed = begins & (before <= last) & (last <= before) & (before + one < outer);
     const Mask<V> there = stays | former | passed;
@@ -87,14 +88,14 @@ void reattach(Segments& segments, Layers<V>& layers, V before, V outer, double l
             select(differs, rim, layers.rim)};
 }
 
-// Segments that lie `stride` apart.
+// Segments in an array, `stride` apart.
 template <class V, class Stored = Segment<V>>
 struct StoredSegments {
   Stored* first;
   long long stride;
-  int* stored;  // in the lane that has most
+  int* stored;  // how many there are in the lane that has most
   int rings;
-  Segment<V>* seen = nullptr;  // where `remember` copies them, one after the other, and how many they are
+  Segment<V>* seen = nullptr;  // where `remember` copies the segments, one after the other, and their number
   int* seen_count = nullptr;
 
   V last() const { return splat<V>(rings - 2.0); }
@@ -109,7 +110,7 @@ struct StoredSegments {
     for (int k = 0; k < count(); ++k) seen[k] = get(k);
   }
 
-  // From rings, of which `ring(j)` reads one. With `apart` each is a segment of its own, whatever it holds.
+  // Makes the segments from rings; `ring(j)` reads f of ring j. With `apart` each ring is a segment of its own.
   template <class Ring>
   Layers<V> load(V outer, double lacking, bool apart, const Ring& ring) {
     const int end = static_cast<int>(largest(outer)) + 1;
@@ -133,12 +134,12 @@ struct StoredSegments {
     return layers;
   }
 
-  // The first `end` rings of a contact that reaches to `outer`, to `put(j, f)`.
+  // Calls `put(j, f)` for the first `end` rings of a contact whose outermost ring is `outer`.
   template <class Put>
   void unload(const Layers<V>& layers, V outer, int end, const Put& put) const {
-    int next[kLanes<V>] = {};  // segment of each lane
+    int next[kLanes<V>] = {};  // the next segment of each lane
     Segment<V> now = no_segment<V>();
-    V until{};  // where they begin
+    V until{};  // where the next segments begin
     for (int j = 0; j < end; ++j) {
       const V at = splat<V>(j);
       const unsigned begins = bits(until <= at);
