@@ -24,9 +24,9 @@ namespace GMEM_ISA {
 constexpr int kChunk = 16;  // grains per piece of work, and per partial sum of the wall forces
 static_assert(kChunk % kMaxWidth == 0, "a chunk holds whole vectors of grains");
 
-// The numbers of one unit - a grain of W replicas, or W grains of one replica - that contacts look at ...
+// The numbers of one unit (a grain of W replicas, or W grains of one replica). Contacts look at the hot ones;
 enum Hot { kPosition = 0, kVelocity = 3, kSpin = 6, kForce = 9, kTorque = 12, kHot = 15 };
-// ... and those that only its integration needs. Half-step velocities wait in the place of accelerations.
+// only the integration needs the cold ones. Midway in a step velocities and spins are those of the half step.
 enum Cold { kQuaternion = 0, kAcceleration = 4, kSpinRate = 7, kCold = 10 };
 
 struct FieldPlace {
@@ -52,19 +52,19 @@ struct Faces {
   Vec<V> through;
 };
 
-// Bits of the planes that a sphere of a unit remembers: now, and at any time since the call began.
+// Bits of the planes at which a sphere of a unit has a history other than 0: now, and at any time since the call began.
 struct KnownPlanes {
   unsigned char now, ever;
 };
 
-// What the histories of the contacts were when a step looked at them; kept where the step is to be gone through backwards.
+// The histories of contacts before a step changes them, which reverse mode keeps for the way back.
 template <class V>
 struct Trace {
-  int* touching = nullptr;  // [candidates]: those of each domain that touch, in order, from its first candidate on
-  int* end = nullptr;       // [candidates]: where these end, at the first candidate of each domain
-  V* history = nullptr;     // [candidates, kHistory] of the law: theirs, in the places of `touching`
-  Segment<V>* segment = nullptr;  // [candidates, Q], where a contact came to another ring
-  int* segments = nullptr;        // [candidates]; -1 where it did not
+  int* touching = nullptr;  // [candidates]: those that touch, in order, in each domain from its first candidate on
+  int* end = nullptr;       // [candidates]: where those end; given in the place of the domain's first candidate
+  V* history = nullptr;     // [candidates, kHistory] of the law: histories, in the order of `touching`
+  Segment<V>* segment = nullptr;  // [candidates, Q]: Mindlin's, where a contact came to another ring
+  int* segments = nullptr;        // [candidates]: how many; -1 where it stayed in its ring
 };
 
 // The memory of an `Engine`.
@@ -76,16 +76,16 @@ struct EngineLayout {
   V* hot;                           // [units, kHot]
   V* cold;                          // [units, kCold]
   V* offsets;                       // of the pack, where they carry derivatives, [K, 3]
-  double* walls;                    // partial sums, [chunks, 2, 3] in the mode's own layout
+  double* walls;                    // partial sums of wall forces, [chunks, 2, 3] in the mode's own layout
   V* fastest;                       // squares of the largest half-step velocity and spin, [chunks, 2]
-  double* sections;                 // of periodic boxes, as `walls`: see `section`
+  double* sections;                 // in periodic boxes: partial sums of `section`, as `walls`
   V* through;                       // ... and the forces through their faces, [domains, 3]
-  V* wall_history;                  // of walls with friction, [units, wall_rows, Law::kHistory]
-  KnownPlanes* remembered;          // ... what of that is not 0, [units, spheres of a grain]
-  bool* remembers;                  // ... whether anything is, [units]
+  V* wall_history;                  // at walls with friction, [units, wall_rows, Law::kHistory]
+  KnownPlanes* remembered;          // ... the planes where it is not 0, [units, spheres of a grain]
+  bool* remembers;                  // ... whether a unit has such planes, [units]
   Segment<V>* wall_segment;         // ... of the Mindlin law, [Q, units, wall_rows]
-  int *wall_segments, *wall_rings;  // ... how many, and as in `Marks`, [units, wall_rows]
-  V* rubbed;                        // what their friction is of the force on a unit in a periodic box, [units, 3]
+  int *wall_segments, *wall_rings;  // ... their number, and `Marks::rings`, [units, wall_rows]
+  V* rubbed;                        // in periodic boxes: the friction of walls in the force on a unit, [units, 3]
   typename Mode::Layout of_mode;
 
   void place(const Problem& p, const Block& block, Arena& arena) {
@@ -127,13 +127,13 @@ struct Engine : EngineLayout<Mode> {
   V parameter[kParameters];
   GrainParameters<V> constants;
   WallLaw<V> wall_law;   // where walls have friction
-  double arm;            // of the outermost sphere of a grain, of the largest where they differ in size
-  double outer;          // radius about the centre of a grain of size 1 that holds it
-  WallState<V> box_now;  // in the step under way, without walls along periodic axes
+  double arm;            // of the outermost sphere centre of a grain, in the largest grain
+  double outer;          // radius of a ball about the centre of a grain of size 1 that holds the grain
+  WallState<V> box_now;  // walls in the step under way, except those of periodic axes
   double travel = 0.0;   // how much closer any two spheres can have come since the call began
   int current = 0;       // step under way
   bool deforms = false;  // whether the shape of a grain has a derivative
-  Trace<V> trace;        // of contacts with walls: its segments alone, see `Replicas::trace`
+  Trace<V> trace;        // of contacts with walls, and only its segments; `Replicas::trace` has the rest
 
   Engine(const Problem& problem, const Block& block, Team& team, int rank, void* scratch)
       : problem(problem), block(block), plan(*block.pack->plan), team(team), rank(rank), mode(problem, block) {
@@ -171,7 +171,7 @@ struct Engine : EngineLayout<Mode> {
     return {load_vec(w), load_vec(w + 3), load_vec(w + 6), load_vec(w + 9)};
   }
 
-  // Of a periodic box at the end of a step, or before the first: its edges ...
+  // The edges of a periodic box at the end of a step, or, if `step` is negative, before the first step.
   WallState<V> cell_edges(int step) const {
     if (step >= 0) return walls_at(step);
     V edge[6];
@@ -181,7 +181,7 @@ struct Engine : EngineLayout<Mode> {
     return box;
   }
 
-  // ... and what follows from them.
+  // The periodic box with these edges.
   Cell<V> cell_at(int step) const { return Cell<V>::of(problem.periodic, cell_edges(step)); }
 
   // Unit u between two steps.
@@ -193,7 +193,7 @@ struct Engine : EngineLayout<Mode> {
             load_vec(c + kAcceleration), load_vec(c + kSpinRate)};
   }
 
-  // First half of a step of unit u, midway, and wall forces.
+  // Stores unit u midway in a step, and finds its spheres and the forces of the walls.
   GMEM_INLINE void begin(int u, const HalfStep<V>& m, const WallState<V>& box, double* wall_sums, V* speeds) {
     V* h = hot + static_cast<std::size_t>(u) * kHot;
     V* c = cold + static_cast<std::size_t>(u) * kCold;
@@ -225,7 +225,8 @@ struct Engine : EngineLayout<Mode> {
     if (near) mode.add_walls(u, wall_sums, on.lower, on.upper);
   }
 
-  // Apart from `begin`, and of what that has stored: so what it does of equal spheres stays in registers.
+  // A function apart from `begin`, which reads the numbers that `begin` has stored: so `begin` keeps those of equal
+  // spheres in registers.
   __attribute__((noinline)) bool unequal_spheres(int u, WallForces<V>& on) {
     const HalfStep<V> m = half_step_of(u);
     return with_offsets([&](const auto* offsets) __attribute__((always_inline)) {
@@ -235,7 +236,7 @@ struct Engine : EngineLayout<Mode> {
     });
   }
 
-  // Friction of the walls on unit u; apart from `begin` likewise.
+  // Friction of the walls on unit u; a function apart from `begin` for the same reason.
   __attribute__((noinline)) WallFriction<V> rub(int u) {
     using Law = typename Mode::OfLaw;
     const HalfStep<V> m = half_step_of(u);
@@ -263,7 +264,7 @@ struct Engine : EngineLayout<Mode> {
     return on;
   }
 
-  // Mindlin's segments in a row of the histories of walls.
+  // Mindlin's segments in a row of the histories at walls.
   StoredSegments<V> wall_segments_of(std::size_t row) const {
     const std::ptrdiff_t rows = static_cast<std::ptrdiff_t>(Mode::units(problem)) * problem.wall_rows();
     StoredSegments<V> found{wall_segment + row, rows, wall_segments + row, problem.points};
@@ -278,18 +279,18 @@ struct Engine : EngineLayout<Mode> {
     return Reach<V, Law::variant>(wall_history[row * Law::kHistory + kLastOverlap], wall_law.law, last).outer;
   }
 
-  // Row `row` of those of unit u in the histories of walls.
+  // The row in the histories at walls, for row `row` of those of unit u.
   std::size_t wall_row(int u, int row) const { return static_cast<std::size_t>(u) * problem.wall_rows() + row; }
 
-  // Calls `each` with the rows of unit u in the histories of walls: with the number among those of a grain and of all, and
-  // the bits of what its sphere remembers.
+  // Calls `each(row, of_all, planes)` for the rows of unit u in the histories at walls. `row` counts those of a grain,
+  // `of_all` those of all grains; `planes` are the known planes of the row's sphere.
   template <class Each>
   void for_walls(int u, const Each& each) const {
     for (int row = 0; row < problem.wall_rows(); ++row)
       each(row, wall_row(u, row), remembered[wall_row(u, row) / kPlanes]);
   }
 
-  // From the arrays of the call ...
+  // Copies the histories at walls of unit u from the arrays of the call ...
   void load_walls(int u) {
     using Law = typename Mode::OfLaw;
     remembers[u] = false;
@@ -331,13 +332,13 @@ struct Engine : EngineLayout<Mode> {
     });
   }
 
-  // What `begin` left of unit u: the same places.
+  // Unit u midway in a step, which `begin` stored in the places of `still`.
   HalfStep<V> half_step_of(int u) const {
     const Grain<V> g = still(u);
     return {g.position, g.orientation, g.velocity, g.spin};
   }
 
-  // Second half: accelerations and velocities. In a periodic box of `cell` sums up its sections.
+  // Second half of a step: accelerations and velocities. In a periodic box `cell` adds each `section` to `sums`.
   Grain<V> finish(int u, const Cell<V>* cell, double* sums) const {
     Vec<V> force, torque;
     mode.total_force(u, force, torque);
@@ -394,9 +395,9 @@ struct Engine : EngineLayout<Mode> {
     if (begins) add_travel(cell);
   }
 
-  // A sphere moves by at most dt (|v| + |spin| arm) in a step; two may approach each other by twice that. Strain of a periodic
-  // box brings grains closer by its rate times their distance, of which that of spheres is at most
-  // `Plan::far`.
+  // A sphere moves by at most dt (|v| + |spin| arm) in a step; two may approach each other by twice that. The strain of
+  // a periodic box brings grains closer by dt times its rate times the distance of their centres. For spheres no
+  // farther apart than `Plan::far`, that distance is at most `Plan::far` + 2 arm.
   void add_travel(const Cell<V>& cell) {
     V speed{}, spin{};
     for (int chunk = 0; chunk < chunks(problem); ++chunk) {
@@ -492,7 +493,7 @@ struct Engine : EngineLayout<Mode> {
       grains(true, more && !delivers, step + 1);
       if (problem.periodic) {
         if (rank == 0) total = total + section_pressure_at(step);
-        team.barrier();  // before others write what that was made of
+        team.barrier();  // before other threads overwrite the sums
       }
       if (!delivers) continue;
       deliver(step + 1, total);

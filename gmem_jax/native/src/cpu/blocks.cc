@@ -13,9 +13,9 @@ namespace gmem {
 
 namespace {
 
-constexpr double kShare = 0.5;  // of the cache that is for blocks: the arrays of the call and other processes want some
+constexpr double kShare = 0.5;  // of the cache, for blocks; the arrays of the call and other processes need the rest
 
-// Some blocks at once, each by a team; `threads` are shared out to them, to each at most one per domain.
+// Runs some blocks at once, each by a team. The teams share out `threads`; none has more threads than domains.
 void run_teams(const Problem& problem, const InstructionSet& kernel, const Block* blocks, int count, int threads,
                int domains, std::size_t bytes) {
   std::vector<std::unique_ptr<Team>> team;
@@ -36,8 +36,8 @@ void run_teams(const Problem& problem, const InstructionSet& kernel, const Block
 
 }  // namespace
 
-// As many blocks at once as fit into the cache, each by a team: side by side they would push each other out. More where
-// threads would have nothing to do otherwise.
+// Runs as many blocks at once as fit into the cache: more would push each other out. It runs more only where threads
+// would have nothing to do otherwise.
 void run_blocks(const Problem& problem, const InstructionSet& kernel, const std::vector<Block>& blocks, int threads) {
   const int count = static_cast<int>(blocks.size());
   if (count == 0) return;

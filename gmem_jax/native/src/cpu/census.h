@@ -1,5 +1,5 @@
-// What is counted and compared in a configuration. Lanes are replicas; where these are few, each is done by itself.
-// Numbers of contacts, and the largest of something, do not depend on the order in which threads look.
+// The census of a configuration. Lanes are replicas; where replicas are few, each is done by itself. Numbers of
+// contacts and largest values do not depend on the order in which threads look.
 
 #pragma once
 
@@ -42,12 +42,12 @@ class Tally {
   std::array<std::int64_t, std::size_t{1} << lanes> count_{};
 };
 
-// What one thread saw.
+// The counts and largest values that one thread found.
 template <class V>
 struct Share {
   Tally<kLanes<V>> spheres, walls;
   V deepest, fastest{}, farthest{};  // an overlap, and the squares of a speed and a distance
-  V amiss{}, lost{};  // 0, or not a number: of what the next step goes on from, and of what makes these three
+  V amiss{}, lost{};  // 0, or not a number: of numbers that the next step needs; of those that make these three
   unsigned outside = 0;
   bool foreign = false;  // a candidate is not of this pack
 };
@@ -99,7 +99,7 @@ class CensusOf {
   // 0, or not a number where one of these is not finite.
   static V nothing_of(Vec<V> a) { return (a.x - a.x) + (a.y - a.y) + (a.z - a.z); }
 
-  // The bits of the lanes where a sphere's centre is beyond one of two walls; counts those that it touches.
+  // The bits of the lanes where a sphere's centre is beyond one of two walls. Counts the walls that the sphere touches.
   unsigned at_walls(V x, V lower, V upper, V radius, Tally<kLanes<V>>& touching) const {
     const V above = x - lower, below = upper - x;
     const unsigned one = bits_less(above, radius) & all_, other = bits_less(below, radius) & all_;
@@ -227,7 +227,7 @@ class CensusOf {
 
 constexpr int kCandidatesOfAThread = 1024;  // fewer are looked at sooner than a thread wakes
 
-// As many replicas side by side as the steps have: see `run_blocks`.
+// Puts as many replicas side by side as the steps do: see call/handler.cc.
 inline void census(const Configuration& c, int most) {
   const int threads = std::min(most, std::max(1, c.candidates / kCandidatesOfAThread));
   const int replicas = static_cast<int>(c.stride);

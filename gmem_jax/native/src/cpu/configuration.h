@@ -1,4 +1,4 @@
-// One configuration of some replicas, as a call has it, and what is counted in it.
+// One configuration of some replicas, as a call has it, and the rows of its census.
 
 #pragma once
 
@@ -26,10 +26,10 @@ enum CensusRow {
 // Pointers to the first of the replicas; rows are `stride` apart.
 struct Configuration {
   int grains, spheres_per_grain, candidates;
-  int periodic;                                // bit of each axis along which the box is
+  int periodic;                                // a bit for each axis along which the box is periodic
   std::ptrdiff_t stride;                       // doubles between two rows: replicas B of the innermost axis
   bool common;                                 // whether all replicas have one reference, [S, 3]
-  const int32_t *first, *second, *grain_pair;  // of each candidate; the last below `candidates`
+  const int32_t *first, *second, *grain_pair;  // of each candidate; grain pairs are below `candidates`
   const bool* valid;
   const int8_t* image;    // [candidates, 3]; null without periodic axes
   const double* radii;    // of the spheres of a grain of size 1; null where all radii are 1

@@ -1,5 +1,5 @@
-// What both modes do alike with the candidates: which of them are looked at, and how their histories come from
-// the arrays of a call and go back.
+// The work on candidates that both modes share: choosing those that are looked at, and copying their histories from the
+// arrays of a call and back.
 
 #pragma once
 
@@ -12,8 +12,8 @@
 namespace gmem {
 namespace GMEM_ISA {
 
-// The travel up to which two spheres that are now apart, by the square of their distance, cannot touch. They do at a
-// distance of `reach`; from `far` on (`Plan::far`) nearer ones are spoken of.
+// The travel up to which two spheres that are now apart cannot touch; `square` is the square of their distance. They
+// touch at the distance `reach`. A distance larger than `far` (`Plan::far`) counts as `far`.
 inline double next_check(double travel, double square, double reach = 2.0, double far = 4.0) {
   const double apart = __builtin_sqrt(square);
   return travel + (1.0 - 1e-9) * ((apart < far ? apart : far) - reach);
@@ -22,10 +22,10 @@ inline double next_check(double travel, double square, double reach = 2.0, doubl
 // What is kept of each candidate beside forces and histories.
 template <class Law>
 struct Marks {
-  bool* touched;       // in any lane, at the last step: only then is there a history to forget
+  bool* touched;       // whether it touched in any lane at the last step: only then is there a history to forget
   double* next_check;  // the travel at which it may next touch: until then it need not be looked at
   int* segments;       // Mindlin: how many are stored
-  int* rings;          // ... of how many rings, at the beginning of the call; those beyond were zero
+  int* rings;          // ... of how many rings at the beginning of the call; rings beyond these were zero
 
   void place(const Plan& plan, Arena& arena) {
     const std::size_t count = static_cast<std::size_t>(plan.candidates) + 1;  // and a dummy
@@ -37,7 +37,7 @@ struct Marks {
 
   static constexpr int kLook = 256;  // candidates looked at at once
 
-  // Of these, from `first` on and before `end`, those that may touch go to `near`; returns how many.
+  // Writes to `near` which of the next kLook candidates, from `first` on and before `end`, may touch. Returns how many.
   GMEM_INLINE int find_near(int first, int end, double travel, int (&near)[kLook]) const {
     constexpr int kWord = 64;
     const int look_end = first + kLook < end ? first + kLook : end;
@@ -56,7 +56,8 @@ struct Marks {
   }
 };
 
-// Rings that may hold something where the outermost is `outer`: one more, since JAX's root may differ in its last digit.
+// How many rings may differ from 0 where the outermost is `outer`. One more is counted, since JAX's root may differ in
+// its last digit.
 template <class V>
 int rings_of(const Problem& p, V outer) {
   const int last = static_cast<int>(largest(outer));
@@ -75,7 +76,7 @@ inline Place ring_place(const Problem& p, std::ptrdiff_t row, int j, int axis) {
   return {0, (row * p.points + j) * 2 + axis};
 }
 
-// Mindlin's rings, of which `number(j, axis)` is one in the arrays of a call, to the layers and segments of a history ...
+// Makes the layers and segments of a history from Mindlin's rings; `number(j, axis)` reads ring j of a call's arrays.
 template <class Law, class V, class Segments, class Outer, class Number>
 void load_rings(V* history, Segments segments, Outer outer, bool apart, const Number& number) {
   const auto ring = [&](int j) {
@@ -85,7 +86,7 @@ void load_rings(V* history, Segments segments, Outer outer, bool apart, const Nu
   store_layers(history + kLayers, segments.load(outer, kLacking<Law::variant>, apart, ring));
 }
 
-// ... and back, by `put(j, axis, number)`; `before` are the rings that there were at first.
+// The way back, by `put(j, axis, number)`; `before` is `Marks::rings`.
 template <class V, class Segments, class Outer, class Put>
 void unload_rings(const Problem& p, const V* history, const Segments& segments, Outer outer, int before,
                   const Put& put) {
@@ -126,7 +127,7 @@ void unload_history(const Mode& mode, std::ptrdiff_t c, const LawParameters<V>& 
   }
 }
 
-// Zero to row number n of those without a candidate.
+// Writes zeros to the histories in the n-th row without a candidate.
 template <class Mode>
 void unload_padding(const Mode& mode, int n, int steps_done) {
   using Law = typename Mode::OfLaw;

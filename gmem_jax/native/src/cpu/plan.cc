@@ -66,8 +66,8 @@ std::vector<int32_t> spatial_order(const List& list) {
   return order;
 }
 
-// A power of two, to end where the bisection did: 4 for a pack of 325 grains, 32 for 31,680. More would occupy more
-// threads, but their sums of forces on each other's grains are written to memory and read again.
+// A power of two, so that domains end where the bisection did: 4 for a pack of 325 grains, 32 for 31,680. More domains
+// would occupy more threads, but they have more remotes, which are written to memory and read again.
 int domains_for(int candidates) {
   const double logarithm = 0.5 * std::log2(std::max(1.0, candidates / 330.0));
   return 1 << static_cast<int>(std::lround(logarithm));
@@ -87,7 +87,7 @@ void check(const List& list) {
   }
 }
 
-// Sorts by a number from 0 to `end`; what has the same stays in order.
+// Sorts by a number from 0 to `end` - 1; candidates with the same number stay in order.
 template <class Number>
 void sort_by(std::vector<Candidate>& candidates, int end, const Number& number) {
   std::vector<int32_t> next(end + 1, 0);
@@ -98,8 +98,8 @@ void sort_by(std::vector<Candidate>& candidates, int end, const Number& number) 
   candidates.swap(sorted);
 }
 
-// Numbers the sums of remote forces by the grain that they act on, so that it finds them together, and then by domain;
-// likewise the contacts of these sums, which are sorted by their domains.
+// Numbers the remotes by the grain that they act on, so that a grain's remotes lie together, and then by domain.
+// Numbers their contacts in the same way; candidates are sorted by their domains.
 void number_remotes(const std::vector<int32_t>& domain_of, PlanStore& store) {
   const std::size_t grains = domain_of.size();
   std::vector<std::vector<int32_t>> of_grain(grains);
@@ -123,7 +123,7 @@ void number_remotes(const std::vector<int32_t>& domain_of, PlanStore& store) {
   }
 }
 
-// There are at most 27 images in boxes that are large enough, so that one replica finds them as rows in the cache.
+// Boxes that are large enough have at most 27 images: as a table of rows, they stay in the cache.
 void number_images(const List& list, PlanStore& store) {
   std::map<std::array<int8_t, 3>, int32_t> number{{{0, 0, 0}, 0}};
   store.images.push_back({0.0, 0.0, 0.0});
@@ -155,7 +155,7 @@ std::shared_ptr<const PlanStore> make_plan(const List& list) {
     candidates.push_back(
         {grain_i * spheres + i % spheres, grain_j * spheres + j % spheres, grain_i, grain_j, -1, -1, row});
   }
-  sort_by(candidates, list.grains, std::mem_fn(&Candidate::away));  // by rows they are
+  sort_by(candidates, list.grains, std::mem_fn(&Candidate::away));  // they are sorted by rows already
   sort_by(candidates, list.grains, std::mem_fn(&Candidate::home));
 
   // Domains end between grains.

@@ -3,8 +3,8 @@
 //
 // Grains are renumbered so that neighbours in space are neighbours in memory. They are divided into domains of about
 // equal numbers of candidates. A candidate belongs to the domain of its lower-numbered grain; one thread computes a
-// domain's contacts in order and adds the forces to that domain's grains at once. Its forces on a grain of another domain
-// ("remote" forces) are summed up apart, and added when that grain is moved.
+// domain's contacts in order and adds the forces to that domain's grains at once. The forces of these contacts on a
+// grain of another domain ("remote" forces) are summed up apart, and added when that grain is moved.
 
 #pragma once
 
@@ -40,8 +40,8 @@ struct PlanStore {
   std::vector<Size> size;
 };
 
-// The plan of a list; that of a list seen lately is remembered. Throws std::invalid_argument if a candidate is not a
-// pair of spheres of different grains.
+// The plan of a list; plans of lists seen lately are kept. Throws std::invalid_argument if a candidate is not a pair of
+// spheres of different grains.
 std::shared_ptr<const PlanStore> plan_for(const List& list);
 
 }  // namespace gmem

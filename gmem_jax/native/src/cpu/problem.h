@@ -4,11 +4,11 @@
 //
 //   pack    a candidate list (as a plan) and the shape of a grain, which replicas may share.
 //   plan    the candidates sorted for memory and threads, with grains and spheres numbered anew (plan.h).
-//   lane    one of the W doubles of a vector of the CPU. In most blocks it has a replica, whose arrays are `ReplicaArrays`.
-//   block   what a team of threads computes at once: W replicas of one pack, each in a lane (replicas.h), or one replica
+//   lane    one of the W doubles of a vector of the CPU. In most blocks a lane has a replica (`ReplicaArrays`).
+//   block   the work of a team of threads at once: W replicas of one pack, each in a lane (replicas.h), or one replica
 //           whose grains and contacts fill the lanes (packed.h). These two are the modes of an `Engine` (block.h).
 //   unit    the grains of one vector: one grain of W replicas, or W grains of one replica.
-//   chunk   16 grains: what a thread takes at once, and of which wall forces are summed before they are added up.
+//   chunk   16 grains, which a thread takes at once. Wall forces are summed over each chunk, then over the chunks.
 //   domain  the contacts that a thread takes at once: those whose lower-numbered grain is in one part of the pack.
 //   remote  the forces of a domain's contacts on a grain of another domain; their sum waits until that grain is moved.
 //
@@ -40,7 +40,7 @@ struct Problem {
   int spheres_per_grain;  // K
   std::ptrdiff_t stride;  // doubles between two rows of an array: replicas B of the innermost axis
   bool mixed = false;     // contacts in single precision; forward only
-  int periodic = 0;       // bit of each axis along which the box is
+  int periodic = 0;       // a bit for each axis along which the box is periodic
   bool rubs = false;      // walls have friction; not in mixed precision
 
   int spheres() const { return grains * spheres_per_grain; }
@@ -70,8 +70,8 @@ struct alignas(32) Image {
 struct alignas(32) Radii {
   double reach;   // R_i + R_j
   double lean;    // (R_i - R_j) / 2: by how much the contact is beyond the place halfway between the spheres, towards j
-  double root;    // of the harmonic mean, 2 R_i R_j / reach
-  double square;  // of reach
+  double root;    // the root of the harmonic mean, 2 R_i R_j / reach
+  double square;  // the square of reach
 };
 
 // Powers of the size of a grain.
@@ -88,15 +88,15 @@ struct Plan {
   int padding;                      // rows of the list without a candidate
   const int32_t* grain;             // number in the call of each grain, [N]
   const Candidate* candidate;       // by domain
-  const int32_t* image;             // which of `images` belongs to each and to a dummy, or null without periodic axes
-  const Image* images;              // those that there are; the first moves nothing
-  const Radii* radii;               // of each and of a dummy, or null where all radii are 1
-  const Size* size;                 // of each grain, or null where all radii are 1, [N]
-  double largest;                   // of the sizes
-  double far;                       // distance from which on spheres are spoken of as nearer: see `Engine::add_travel`
+  const int32_t* image;             // place in `images` for each candidate and a dummy; null without periodic axes
+  const Image* images;              // the different images; the first moves nothing
+  const Radii* radii;               // of each candidate and of a dummy; null where all radii are 1
+  const Size* size;                 // of each grain, [N]; null where all radii are 1
+  double largest;                   // the largest size of a grain
+  double far;                       // a larger distance of spheres counts as this one: see `next_check`
   const int32_t* domain_candidate;  // first candidate of each domain, [domains + 1]
   const int32_t* remote_start;      // the remotes of each grain: remote_start[g] to remote_start[g + 1], [N + 1]
-  // The contacts of these sums likewise, by the grain that they act on; and the sphere of it, [remote_contacts].
+  // The contacts in the remotes of each grain, likewise; and the sphere of that grain in each, [remote_contacts].
   const int32_t* remote_contact_start;
   const int32_t* remote_contact_sphere;
   const int32_t* padding_row;  // [padding]
@@ -122,8 +122,8 @@ struct ReplicaArrays {
   const double* walls;
   double* pressure;
   int steps;
-  const double* offsets;  // only among slopes, [K, 3]
-  // Only among bars, where "in" is by the results and "out" by the arguments:
+  const double* offsets;  // only in `Block::slopes`, [K, 3]
+  // Only in `Block::bars`, where "in" are derivatives by the results, and "out" are derivatives by the arguments:
   double* parameters_out;
   double* walls_out;
   double* offsets_out;
@@ -134,7 +134,7 @@ struct Block {
   const ReplicaArrays* lanes;
   const ReplicaArrays* slopes;      // derivatives of the arguments along a direction, and of results that are tangents
   const ReplicaArrays* bars;        // in reverse mode, derivatives by the results and by the arguments
-  const ReplicaArrays* bar_slopes;  // derivatives of the former along the direction
+  const ReplicaArrays* bar_slopes;  // derivatives of `bars` along the direction
   int count;                        // 1 to W, or to 2 W where it is wide
   bool packed;                      // the lanes of the CPU are grains and contacts of one replica
   bool wide = false;                // in mixed precision: two vectors of doubles to one of floats
@@ -159,7 +159,7 @@ struct Arena {
 
 struct Configuration;  // see configuration.h
 
-// A compiled instruction set; of steps, not of their derivatives, it has `census` too.
+// The functions compiled for an instruction set. `census` is null where they are compiled for derivatives.
 struct InstructionSet {
   const char* name;
   int width;
@@ -168,8 +168,8 @@ struct InstructionSet {
   void (*census)(const Configuration&, int threads);
 };
 
-// The best that this CPU has. The lanes of derivatives are replicas: few of them are done sooner in narrow vectors. Second
-// derivatives always are: native/build.py says why.
+// The best instruction set of this CPU. In derivatives the lanes are replicas, and few replicas are done sooner in
+// narrow vectors. Second derivatives always have narrow vectors: native/build.py says why.
 const InstructionSet& best_kernel(Task task, std::size_t replicas);
 
 }  // namespace gmem

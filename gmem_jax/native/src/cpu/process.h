@@ -1,4 +1,4 @@
-// What a process has one of.
+// Objects of which a process has one.
 
 #pragma once
 

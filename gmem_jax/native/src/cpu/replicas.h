@@ -1,5 +1,5 @@
-// W replicas of a pack side by side: each vector is one number of one grain or contact. See `Engine` in
-// block.h for how it is used.
+// The mode for W replicas of a pack side by side: each vector is one number of one grain or contact, in all of them.
+// See `Engine` in block.h for how it is used.
 
 #pragma once
 
@@ -18,8 +18,8 @@ namespace GMEM_ISA {
 template <class V>
 constexpr int kReplicas = std::is_same<V, Pair>::value ? 2 * W : W;
 
-// How numbers are put together from the arrays of a block, and which of them are results. `gather` has a vector of
-// lanes from the given one on.
+// How numbers are put together from the arrays of a block, and which part of them is a result. `gather(lanes, first)`
+// returns a vector of lanes, from lane `first` on.
 template <class V, class Gather>
 inline V of_lanes(const Block& block, const Gather& gather) {
   if constexpr (std::is_same<V, Real>::value) {
@@ -34,7 +34,8 @@ inline Real result(Real a) { return a; }
 inline Pair result(Pair a) { return a; }
 inline Real result(Dual<Real> a) { return a.slope; }
 
-// Overlaps are small differences of distances: `before` holds that of their squares, taken in double precision.
+// An overlap is a small difference of distances. In mixed precision `before` is first the difference of their squares,
+// taken in double precision.
 template <int N>
 GMEM_INLINE Single<N> overlap_of(const Contact<Single<N>>& c) {
   return c.before / fma(c.square, c.inverse, Single<N>::of(2.0));
@@ -50,10 +51,10 @@ struct GrainMotion {
 template <class Law, class V, class C>
 struct ReplicasLayout {
   V* sphere;               // [S, 3]: centres
-  GrainMotion<C>* motion;  // [N], in mixed precision; in the other, `hot` has all
+  GrainMotion<C>* motion;  // [N], in mixed precision; otherwise `hot` has these numbers
   C* remote;               // [remotes, 6]: sums of forces and torques
   C* history;              // [candidates, Law::kHistory]
-  Segment<C>* segment;     // [Q, candidates] of the Mindlin law: those that are few lie together
+  Segment<C>* segment;     // [Q, candidates] of the Mindlin law: segment k of all contacts lies together
   Marks<Law> marks;
 
   void place(const Problem& p, const Plan& plan, Arena& arena) {
@@ -67,7 +68,7 @@ struct ReplicasLayout {
   }
 };
 
-// V is the number of grains, C that of contacts and their histories: the same, or single precision.
+// V is the type of a grain's numbers, C that of contacts and their histories: the same, or in single precision.
 template <class Law, class V, class C = V>
 struct Replicas : ReplicasLayout<Law, V, C> {
   using Layout = ReplicasLayout<Law, V, C>;
@@ -82,9 +83,9 @@ struct Replicas : ReplicasLayout<Law, V, C> {
   const Plan& plan;
   bool adjacent;  // the lanes are neighbours in every array of the call
   bool together;  // they all have the same number of steps
-  V* hot;         // the engine's
+  V* hot;         // `Engine::hot`
   Trace<C> trace;
-  bool apart = false;  // Mindlin's rings each by itself, for their derivatives
+  bool apart = false;  // each of Mindlin's rings is a segment, for their derivatives
 
   Replicas(const Problem& problem, const Block& block) : problem(problem), block(block), plan(*block.pack->plan) {
     adjacent = neighbours(block.lanes);
@@ -214,8 +215,8 @@ struct Replicas : ReplicasLayout<Law, V, C> {
     write(out, place.row, convert<V>(number), steps_done);
   }
 
-  // A number of the history in `row` of those that the grain of unit u has at walls; `place_at` has its place by the row of
-  // all.
+  // One number of a history at walls, for the grain of unit u. `row` counts the rows of one grain; `place_at` finds the
+  // place in the arrays of the call from the row among those of all grains.
   template <class PlaceAt>
   V wall_in(int u, int row, const PlaceAt& place_at) const {
     const Place place = place_at(wall_row(u, row));
@@ -295,7 +296,7 @@ struct Replicas : ReplicasLayout<Law, V, C> {
     contacts_of<false>(first, end, parameter, law, travel, faces);
   }
 
-  // ... of spheres that `differ` in radius or do not.
+  // `contacts` of spheres that `differ` in radius, or do not.
   template <bool differ>
   void contacts_of(int first, int end, const C* parameter, const LawParameters<C>& law, double travel,
                    Faces<V>& faces) {
@@ -310,8 +311,8 @@ struct Replicas : ReplicasLayout<Law, V, C> {
       for (int n = 0; n < found; ++n) {
         const int c = near[n];
         const Candidate& pair = plan.candidate[c];
-        // Large packs are in no cache: ask in time for what does not lie in a row with what others want. (In a function of
-        // its own GCC takes this for nothing.)
+        // Large packs are in no cache: prefetch the data of a later contact that do not lie next to those of others.
+        // (In a function of its own GCC drops the prefetches.)
         if (n + kAhead < found) {
           const std::size_t later = near[n + kAhead];
           const V* of_sphere = sphere + 3 * static_cast<std::size_t>(plan.candidate[later].other);
@@ -352,7 +353,7 @@ struct Replicas : ReplicasLayout<Law, V, C> {
     if (trace.touching && first < end) trace.end[first] = remembered;
   }
 
-  // Of a contact between spheres at these places, that of the image if the box is periodic.
+  // The input of a contact between spheres with these centres; in a periodic box, `other` is the centre of the image.
   GMEM_INLINE ContactInput<C> input_of(std::size_t c, Vec<V> one, Vec<V> other, const Cell<V>& cell) const {
     ContactInput<C> input = contact_input(plan.candidate[c], one, other);
     if constexpr (!kMixed)

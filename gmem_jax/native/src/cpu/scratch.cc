@@ -27,7 +27,7 @@ class ScratchPool {
         return found;
       }
     }
-    // In large pages, where the system has them to give: those of 4 kB are more than a CPU has translations for.
+    // In large pages, where the system has them: pages of 4 kB would be more than a CPU keeps translations for.
     const std::size_t alignment = bytes < kLargePage ? 64 : kLargePage, whole = (bytes / alignment + 1) * alignment;
     Scratch piece;
     piece.memory.reset(static_cast<char*>(std::aligned_alloc(alignment, whole)));

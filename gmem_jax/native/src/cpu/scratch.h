@@ -17,7 +17,7 @@ struct Scratch {
   void* aligned() const { return memory.get(); }  // to 64 bytes
 };
 
-// At least so many bytes, whatever is in them. Throws std::bad_alloc.
+// At least so many bytes, with any contents. Throws std::bad_alloc.
 Scratch take_scratch(std::size_t bytes);
 void give_scratch(Scratch piece);
 

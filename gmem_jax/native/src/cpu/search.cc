@@ -60,7 +60,7 @@ struct Cells {
     }
   }
 
-  // Calls `look` with every point in the cells around `x`, and where it is.
+  // Calls `look` with every point in the cells around `x`, and its place.
   template <class Look>
   void around(const double* x, const Look& look) const {
     int64_t from[3], to[3];
@@ -76,7 +76,7 @@ struct Cells {
   }
 };
 
-// The pairs of spheres `first` to `last` - 1, as of `gmem_search`.
+// The pairs whose sphere i is from `first` to `last` - 1, as numbers of `gmem_search`.
 std::vector<int64_t> pairs_of(const Cells& cells, const double* centres, int64_t spheres, int64_t spheres_per_grain,
                               double reach, int64_t first, int64_t last) {
   const double surely_apart = reach * reach * (1.0 + 1e-12);  // the root decides, where it is needed
@@ -102,8 +102,9 @@ constexpr int64_t kSpheresOfAThread = 2048;  // fewer are found sooner than a th
 
 }  // namespace gmem
 
-// Pairs i < j of spheres of different grains whose centres [S, 3], finite, are closer than `reach`, in order, as numbers
-// i S + j. Writes the first `room` of them to `keys`; returns how many there are, or -1 without memory or threads.
+// Pairs i < j of spheres of different grains whose centres [S, 3], finite, are closer than `reach`, in order, as
+// numbers i S + j. Writes the first `room` of them to `keys`; returns how many there are, or -1 without memory or
+// threads.
 extern "C" int64_t gmem_search(const double* centres, int64_t spheres, int64_t spheres_per_grain, double reach,
                                int64_t* keys, int64_t room) {
   try {

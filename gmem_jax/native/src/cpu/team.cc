@@ -33,8 +33,9 @@ inline void pause() {
 #endif
 }
 
-// Looks until something is ready or some time has passed: who sleeps and is woken may be 0.1 ms late, as long as a sample
-// takes between two calls. After some microseconds, which on a quiet machine are enough in a step, lets others have this CPU.
+// Polls until `ready()` is true or some time has passed. A thread that sleeps may wake 0.1 ms late, as long as a sample
+// takes between two calls. After some microseconds, which are enough in a step on a quiet machine, the CPU is yielded
+// to other threads.
 template <class Ready>
 void linger(const Ready& ready) {
   constexpr int kSpins = 200;
@@ -45,7 +46,7 @@ void linger(const Ready& ready) {
     std::this_thread::yield();
 }
 
-// Quota over period of a folder of either version of control groups, as files have them; infinite where they have none.
+// The quota of CPU time over its period, from the files of a control group of either version; infinite without a quota.
 double share_in(const std::string& folder) {
   double quota = 0.0, period = 0.0;
   std::ifstream both(folder + "/cpu.max"), first(folder + "/cpu.cfs_quota_us"), second(folder + "/cpu.cfs_period_us");
@@ -59,7 +60,7 @@ class Pool {
  public:
   void run(int threads, const std::function<void(int)>& work) {
     std::unique_lock<std::mutex> lock(mutex_);
-    // There is a worker for every rank of every job: those of a team wait for each other.
+    // There is a worker for every rank of every job, since the ranks of a team wait for each other.
     for (; workers_ < ranks_ + threads - 1; ++workers_) std::thread([this] { serve(); }).detach();
     ranks_ += threads - 1;
     Job job{&work, threads - 1, threads - 1, {}};
@@ -96,8 +97,8 @@ class Pool {
  private:
   struct Job {
     const std::function<void(int)>* work;
-    int next;               // the ranks up to it have not begun
-    std::atomic<int> left;  // so many of them have not ended
+    int next;               // ranks from 1 to this one have not begun
+    std::atomic<int> left;  // how many ranks have not ended
     std::condition_variable done;
   };
 
@@ -123,8 +124,8 @@ class Pool {
   std::mutex mutex_;
   std::condition_variable wake_, free_;
   std::deque<Job*> jobs_;        // with ranks that have not begun
-  std::atomic<int> posted_{0};   // jobs there have been
-  int workers_ = 0, ranks_ = 0;  // and how many of them are spoken for
+  std::atomic<int> posted_{0};   // how many jobs have been posted
+  int workers_ = 0, ranks_ = 0;  // workers, and the ranks of jobs that need one
   int calls_ = 0, used_ = 0;     // calls in progress or waiting, and the threads they have
 };
 
@@ -172,7 +173,7 @@ void Team::barrier() {
   linger(over);
   if (!over()) {
     std::unique_lock<std::mutex> lock(mutex_);
-    ++asleep_;  // before looking once more: whoever ends the phase looks for sleepers after it
+    ++asleep_;  // before `over` is called again: the thread that ends the phase looks for sleepers afterwards
     wake_.wait(lock, over);
     --asleep_;
   }

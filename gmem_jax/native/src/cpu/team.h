@@ -36,14 +36,15 @@ class Team {
 
   // Wait for the whole team.
   void barrier();
-  // Open the share of `rank` in a phase of `chunks` chunks. Since the queue was emptied there must have been a barrier.
+  // Open the share of `rank` in a phase of `chunks` chunks. A barrier must come between the last `take` from the queue
+  // and this.
   void share(Queue queue, int rank, int chunks);
   // The next chunk for `rank`; false when all have been taken.
   bool take(Queue queue, int rank, int* chunk);
 
  private:
-  // The next chunk in the lower half, the end in the upper: in one word, since who takes while the share is being opened
-  // must not see one of them without the other.
+  // The next chunk in the lower half, the end in the upper half of one word: a thread that takes a chunk while the
+  // share is being opened must not see one without the other.
   struct alignas(64) Share {
     std::atomic<std::uint64_t> range{0};
   };
@@ -61,8 +62,8 @@ class Team {
   Share shares_[kQueues][kMaxSize];
 };
 
-// Threads for the length of one call, the caller's own among them. Calls at once share out the CPUs; one for which none
-// is left waits until there is.
+// Threads for the length of one call, the caller's own among them. Calls that run at once share out the CPUs. A call
+// for which no CPU is left waits for one.
 class Threads {
  public:
   explicit Threads(int wanted);
@@ -73,15 +74,16 @@ class Threads {
   const int count;
 };
 
-// Run `work(rank)` for rank 0 (here) to threads - 1 (in the pool) and wait for all; then throw what the first of them to
-// fail threw.
+// Run `work(rank)` for rank 0 (here) to threads - 1 (in the pool) and wait for all; then throw what the first of them
+// to fail threw.
 void run_ranks(int threads, const std::function<void(int)>& work);
 
-// CPUs that this process may keep busy: those it may run on, or fewer where its control group has a quota of their time.
+// CPUs that this process may keep busy: those it may run on, or fewer where its control group has a quota of their
+// time.
 int cpus();
 
-// The least quota of CPU time of the control groups that are listed in the file `groups` (/proc/self/cgroup) and lie in the
-// folder `root` (/sys/fs/cgroup), in CPUs, rounded up; the largest number where there is none.
+// The least quota of CPU time of the control groups that are listed in the file `groups` (/proc/self/cgroup) and lie in
+// the folder `root` (/sys/fs/cgroup), in CPUs, rounded up; the largest number where there is none.
 int quota_of(const std::string& groups, const std::string& root);
 
 // Threads to use: the environment's GMEM_THREADS, or `cpus`. Throws std::invalid_argument if
