@@ -47,8 +47,8 @@ struct Signature {
   Wants arguments, results;
 };
 
-// Arguments of all tasks are those of the steps themselves; then, for derivatives, a number for each of the arguments', or
-// of the results, that there are: see `Task`.
+// The arguments of every task begin with those of the steps. Then come, as `Task` says, derivatives of the arguments
+// along a direction, derivatives by the results, and derivatives of the latter along the direction.
 // gmem_jax/native/calls.py: call_library, of_results, of_arrays
 Signature signature(Task task, Law law, bool rubs) {
   const Wants pack = {{"first spheres", "P", ffi::S32},
@@ -125,7 +125,7 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
           "walls' histories are not those of all spheres");
   problem.history_aliased = task == Task::forward && leaves > 0;
   const int64_t all_leaves = rubs ? 2 * leaves : leaves;
-  const bool of_results = task == Task::forward || task == Task::tangent;  // what is wanted is
+  const bool of_results = task == Task::forward || task == Task::tangent;  // otherwise they are by arguments
   const bool has_slopes = task == Task::tangent || task == Task::second_adjoint;
   for (int64_t leaf = 0; leaf < all_leaves; ++leaf)
     problem.history_aliased &= in[kHistoryIn + leaf].data == out[kHistoryOut + leaf].data;
@@ -221,7 +221,7 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
                    packed,
                    wide};
     };
-    // Replicas side by side share much work: a vector that is half full is cheaper than they are one by one.
+    // Replicas side by side share much work: a vector that is half full is cheaper than its replicas one by one.
     for (; problem.mixed && done < count; done += 2 * kernel.width)
       whole.push_back(block_of(2 * kernel.width, false, count - done > kernel.width));
     for (; 2 * (count - done) >= kernel.width || (task != Task::forward && done < count); done += kernel.width)

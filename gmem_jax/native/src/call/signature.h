@@ -1,4 +1,4 @@
-// What every platform's handler asks of a call, and what it says when that is not met.
+// The arrays and numbers that the handlers of all platforms require of a call, and their errors.
 
 #pragma once
 
@@ -15,9 +15,9 @@
 
 namespace gmem {
 
-// Axes are edges of a periodic box by which an image is moved I (none, or three), sizes where spheres differ in radius U
-// (none, or one), grains N, spheres of a grain K and of all S, candidates P, parameters R, steps T, numbers of the walls W,
-// Mindlin's points Q, contacts of spheres with walls that have friction F, replicas B.
+// Axes are edges of a periodic box by which an image is moved I (none, or three), sizes where spheres differ in radius
+// U (none, or one), grains N, spheres of a grain K and of all S, candidates P, parameters R, steps T, numbers of the
+// walls W, Mindlin's points Q, contacts of spheres with walls that have friction F, replicas B.
 using Wants = std::vector<Wanted>;
 
 inline Wants operator+(Wants one, const Wants& other) {
@@ -34,7 +34,7 @@ inline Wants histories(Law law) {
   });
 }
 
-// ... of the spheres at walls with friction.
+// Histories of spheres at walls with friction.
 inline Wants wall_histories(Law law, bool rubs) {
   Wants wants = rubs ? histories(law) : Wants{};
   for (Wanted& wanted : wants) wanted.name = "walls' " + wanted.name, wanted.axes[0] = 'F';
@@ -50,7 +50,7 @@ inline Wants fields_of_grains() {
           {"spins", "N3B"},     {"accelerations", "N3B"}, {"spin rates", "N3B"}};
 }
 inline Wants numbers_of_steps() { return {{"parameters", "RB"}, {"walls", "TWB"}}; }
-// What steps are differentiated by.
+// The arrays by which steps are differentiated.
 inline Wants arrays_of_steps(Law law) {
   return fields_of_grains() + numbers_of_steps() + Wants{{"offsets", "K3B"}} + histories(law);
 }
@@ -67,7 +67,7 @@ inline void require_axes(int64_t periodic) {
   require(0 <= periodic && periodic < 8, "the periodic axes should be bits, one each");
 }
 
-// A binding with what a call is given: numbers by name, in the order of a handler's arguments, then arrays.
+// A binding with the arguments of a call: numbers by name, in the order of a handler's arguments, then arrays.
 template <class Binding>
 auto with_arguments(Binding&& binding) {
   return std::forward<Binding>(binding)
@@ -84,7 +84,7 @@ auto with_arguments(Binding&& binding) {
       .RemainingRets();
 }
 
-// What `call` gives, its exceptions as errors of XLA.
+// Returns the result of `call`, or its exception as an error of XLA.
 template <class Call>
 xla::ffi::Error in_words(const Call& call) {
   using xla::ffi::ErrorCode;

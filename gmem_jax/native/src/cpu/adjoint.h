@@ -1,9 +1,9 @@
 // Reverse mode: all steps of one block gone through forwards, then backwards. The physics is that of the other headers,
-// recorded by the compiler (calculations.h) or, where a contact comes to another of Mindlin's rings, on a tape (`Taped`);
-// here stands only who gets which derivative.
+// recorded by the compiler (calculations.h) or, where a contact comes to another of Mindlin's rings, on a tape
+// (`Taped`). This file only passes derivatives on from results to arguments.
 // "Bar" x is the derivative of the final result by x.
 //
-// In numbers that carry a derivative (`Dual`) the same gives the derivative of these derivatives along a direction.
+// With numbers that carry a derivative (`Dual`) this file gives the derivative of these derivatives along a direction.
 //
 // Grains and contacts are shared among the threads of a team as in the forward steps, and sums are taken in the same
 // fixed order.
@@ -68,20 +68,20 @@ struct TapedParameters {
   }
 };
 
-// The memory of an `Adjoint`. What is kept of every step is given room for all candidates; memory that contacts apart
-// leave untouched is not used.
+// The memory of an `Adjoint`. Arrays of every step have room for all candidates; the system provides no memory for the
+// part that is never written because contacts are apart.
 template <class Law, class V>
 struct AdjointLayout {
   EngineLayout<Replicas<Law, V>> of_forward;
   V* state;         // [steps, N, kState]: at the beginning of each step
-  V* total;         // [steps, N, 6]: force and torque in it
+  V* total;         // [steps, N, 6]: force and torque in the step
   Trace<V>* trace;  // [steps]
   V* state_bar;     // [N, kState]
   V* mid_bar;       // [N, kMid]
   V* sphere_bar;    // [S, 3]
   V* remote_bar;    // [remote_contacts, kRemote]
   V* history_bar;   // [candidates, kHistory and the forces of Mindlin's segments, 2 Q]
-  bool* has_bar;    // [candidates]: whether their bars, and those of their remotes, may be other than zero
+  bool* has_bar;    // [candidates]: whether bars of the history and of the remote contact may differ from zero
   V* domain_bar;    // [domains, kParameters + kLawNumbers]
   V* chunk_bar;     // [chunks, kGrainNumbers, the offsets, 3 K, the mass, and kWallLawNumbers]
   V* wall_bar;      // [chunks, kWalls], of one step
@@ -89,7 +89,8 @@ struct AdjointLayout {
   V* faces;            // [steps, 2, 3]: sections of periodic boxes, and forces through their faces
   V* domain_cell_bar;  // [domains, kCellNumbers], of one step
   V* chunk_cell_bar;   // [chunks, 2, kCellNumbers], of the cell in that step and of the one before
-  // Where walls have friction, of what is remembered of them: at the beginning of each step, and which of it is not 0.
+  // Where walls have friction: histories at walls at the beginning of each step, the planes where they are not 0, and
+  // bars.
   V* wall_history;        // [steps, N, wall_rows, kHistory]
   unsigned char* planes;  // [steps, S], bits
   V* wall_history_bar;    // [N, wall_rows, kHistory and the forces of Mindlin's segments, 2 Q]
@@ -105,7 +106,7 @@ struct AdjointLayout {
 
   static bool is_general(const Problem& p, const Plan& plan) { return p.periodic || plan.radii; }
 
-  // With `fills` the traces of the steps are written down too: one thread does it, the others see it after a barrier.
+  // With `fills` also fills in the traces of the steps. One thread does so; the others see them after a barrier.
   void place(const Problem& p, const Block& block, Arena& arena, bool fills = false) {
     of_forward.place(p, block, arena);
     const Plan& plan = *block.pack->plan;
@@ -175,17 +176,18 @@ struct Adjoint : AdjointLayout<Law, V> {
   const bool general;
   Tape<V> recorded;
   V law_numbers[kLawNumbers], grain_numbers[kGrainNumbers], wall_law_numbers[kWallLawNumbers], last_ring;
-  // Of the step that is gone back through: the cell in it and before it, their numbers, and the bars of what is on `faces`.
+  // Of the step that is gone back through: its cell, the numbers of that cell and of the one before, and the bars of
+  // `faces`.
   Cell<V> cell;
   V cell_numbers[kCellNumbers], before_numbers[kCellNumbers], faces_bar[6];
-  V earlier_bar[kCellNumbers] = {};  // of the cell before the steps that were gone back through
+  V earlier_bar[kCellNumbers] = {};  // of the cell before those steps that were gone back through already
 
   Adjoint(const Problem& problem, const Block& block, Team& team, int rank, void* scratch)
       : forward(problem, block, team, rank, scratch), problem(problem), block(block), plan(*block.pack->plan),
         team(team), rank(rank), steps(block.lanes[0].steps), adjacent(all_adjacent()),
         general(Layout::is_general(problem, plan)) {
     Arena arena{static_cast<char*>(scratch)};
-    this->place(problem, block, arena, rank == 0);  // `forward` has found the same at the beginning
+    this->place(problem, block, arena, rank == 0);  // `forward` has its memory at the beginning of the same scratch
     forward.mode.apart = true;
     store_numbers(law_numbers, LawParameters<V>(forward.parameter + kLaw, forward.parameter[kDt]));
     store_numbers(grain_numbers, forward.constants);
@@ -193,7 +195,7 @@ struct Adjoint : AdjointLayout<Law, V> {
     last_ring = splat<V>(problem.points - 2.0);
   }
 
-  // Of sphere k in a grain.
+  // The centre of sphere k in a grain.
   Vec<V> offset_of(int k) const {
     if constexpr (kDual) return load_vec(forward.offsets + 3 * k);
     else return body_at<V>(block.pack->offsets + 3 * k);
@@ -222,7 +224,7 @@ struct Adjoint : AdjointLayout<Law, V> {
     team.barrier();
   }
 
-  // Between the rows of a state and where the forward steps keep them.
+  // Calls `move` with each number of a state and its place in the forward steps.
   template <class Move>
   void move_state(int u, V* s, const Move& move) const {
     for (int f = 0; f < kFields; ++f)
@@ -236,8 +238,7 @@ struct Adjoint : AdjointLayout<Law, V> {
     return of_grain(total + static_cast<std::size_t>(step) * problem.grains * 6, u, 6);
   }
 
-  // What sphere k of grain u remembers of plane w: its row, where it is among the histories of all that begin at `histories`,
-  // and its bars.
+  // The history of sphere k of grain u at plane w: its row, its place in the array `histories`, and its bars.
   std::size_t plane_row(int u, int k, int w) const { return forward.wall_row(u, kPlanes * k + w); }
   V* at_plane(V* histories, int u, int k, int w) const { return histories + plane_row(u, k, w) * Law::kHistory; }
   V* bar_at_plane(int u, int k, int w) const { return wall_history_bar + plane_row(u, k, w) * remembered(problem); }
@@ -248,7 +249,8 @@ struct Adjoint : AdjointLayout<Law, V> {
     return planes[(static_cast<std::size_t>(step) * problem.grains + u) * problem.spheres_per_grain + k];
   }
 
-  // Calls `each(k, w, planes)` for the planes of grain u's spheres, with what the forward steps know of those of sphere k.
+  // Calls `each(k, w, planes)` for sphere k of grain u and plane w; `planes` are those that the forward steps know of
+  // sphere k.
   template <class Each>
   void for_planes(int u, const Each& each) const {
     if (!problem.rubs) return;
@@ -282,7 +284,7 @@ struct Adjoint : AdjointLayout<Law, V> {
     restore_segments(step, u);
   }
 
-  // Mindlin's segments of grain u at walls that a step changes, as they were before. (Others are not looked at in it.)
+  // Puts back Mindlin's segments of grain u at walls that a step changed. (The step does not look at other segments.)
   void restore_segments(int step, int u) const {
     if constexpr (Law::kLayered)
       for_planes(u, [&](int k, int w, const KnownPlanes&) {
@@ -407,7 +409,8 @@ struct Adjoint : AdjointLayout<Law, V> {
     team.barrier();
   }
 
-  // From the bars of rings to those of the layers and segments that they are in at the end, in the bars of one history.
+  // In the bars of one history: from the bars of rings to those of the layers and segments that hold them after the
+  // last step.
   void to_layers(V* history, const StoredSegments<V>& segments, V outer) {
     for (int q = kLayers; q < Law::kHistory; ++q) history[q] = V{};
     for (int part = 0; part < kParts; ++part) {
@@ -426,8 +429,8 @@ struct Adjoint : AdjointLayout<Law, V> {
     }
   }
 
-  // From the bars of layers and segments at the beginning, when each ring is a segment, to those of the rings; of the history in
-  // `row`, of contacts between grains or with walls.
+  // From the bars of layers and segments before the first step, when each ring is a segment, to those of the rings, for
+  // the history in `row`. `histories` are those between grains or at walls.
   void to_rings(V* history, std::ptrdiff_t row, const double* const (ReplicaArrays::*histories)[kMaxHistory]) {
     const LawParameters<V> law(forward.parameter + kLaw, forward.parameter[kDt]);
     const Place place = place_of<Law>(row, kLastOverlap);
@@ -553,7 +556,7 @@ struct Adjoint : AdjointLayout<Law, V> {
     }
   }
 
-  // Mindlin's segments of one contact, on the tape: as they were, then as the law left them.
+  // Mindlin's segments of one contact, on the tape: at first those before the step, then those that the law leaves.
   struct Segments {
     int rings;
     std::vector<Segment<Taped>>* now;
@@ -592,7 +595,7 @@ struct Adjoint : AdjointLayout<Law, V> {
     for (; c < end; ++c) forget(c);
   }
 
-  // Of what a contact needs, that which does not lie in a row with what others want.
+  // Prefetches the numbers of a contact that do not lie next to those of others.
   void ask_for(std::size_t c) const {
     const Candidate& pair = plan.candidate[c];
     const auto ask = [](const V* from, int count) {
@@ -606,7 +609,7 @@ struct Adjoint : AdjointLayout<Law, V> {
     ask(mid + kMidPosition, 3), ask(mid + kMidVelocity, 6), ask(mid + kMidForce, 6);
   }
 
-  // A contact apart has a blank history, whatever it was before.
+  // A contact apart leaves a blank history, whatever the history was before: all bars become zero.
   void forget(std::size_t c) {
     if (!has_bar[c]) return;
     has_bar[c] = false;
@@ -616,7 +619,7 @@ struct Adjoint : AdjointLayout<Law, V> {
       for (int q = 0; q < kRemote; ++q) of_grain(remote_bar, remote, kRemote)[q] = V{};
   }
 
-  // Of a contact as it is between the grains themselves, not their images.
+  // The input of a contact between the grains themselves, not their images.
   ContactInput<V> input_of(const Candidate& pair) const {
     const auto centre = [&](int i) { return load_vec(forward.mode.sphere + 3 * static_cast<std::size_t>(i)); };
     return forward.mode.contact_input(pair, centre(pair.one), centre(pair.other));
@@ -630,22 +633,22 @@ struct Adjoint : AdjointLayout<Law, V> {
             load_vec(other + kMidTorque)};
   }
 
-  // The bars of what a contact's program results in.
+  // The bars of the results of a contact's program.
   void load_result_bars(std::size_t c, V* to) const {
     const ContactLoads<V> loads = loads_bar(plan.candidate[c]);
     store_vec(to, loads.force), store_vec(to + 3, loads.torque_one), store_vec(to + 6, loads.torque_other);
     std::copy_n(history_of(c), Law::kHistory, to + 9);
-    std::copy_n(faces_bar + 3, 3, to + 9 + Law::kHistory);  // which only general calculations have
+    std::copy_n(faces_bar + 3, 3, to + 9 + Law::kHistory);  // only general calculations have these
   }
 
-  // What is constant of sphere k of grain u; see `SphereConstant`.
+  // The constants of sphere k of grain u; see `SphereConstant`.
   void load_constants(int u, int k, V* to) const {
     const double size = plan.size ? plan.size[u].one : 1.0;
     to[kSize] = splat<V>(size);
     to[kRadius] = splat<V>(plan.radii ? block.pack->radii[k] * size : 1.0);
   }
 
-  // What is constant of a contact; see `ContactConstant`.
+  // The constants of a contact; see `ContactConstant`.
   void load_constants(std::size_t c, V* to) const {
     const Image image = plan.image ? plan.image_of(c) : Image{0.0, 0.0, 0.0};
     const Radii radii = plan.radii ? plan.radii[c] : Radii{2.0, 0.0, 1.0, 4.0};
@@ -653,7 +656,8 @@ struct Adjoint : AdjointLayout<Law, V> {
     for (int n = 0; n < kContactConstants; ++n) to[n] = splat<V>(constant[n]);
   }
 
-  // By the program, from the bars of its results to those of the contact's own numbers and of the parameters.
+  // Goes back through the program, from the bars of its results to those of the contact's own numbers and of the
+  // parameters.
   void contact_back(std::size_t c, int domain, const ContactInput<V>& input, const V* history, const V* result_bar,
                     V* own_bar) const {
     V own[kNumbers], *const parameter_bar = of_domain(domain);
@@ -680,8 +684,8 @@ struct Adjoint : AdjointLayout<Law, V> {
     share_out(plan.candidate[c], load_numbers<ContactInput<V>>(own_bar));
   }
 
-  // A contact that comes to another of Mindlin's rings in some lanes: by the tape in these, by the program in the others,
-  // so that what happens in a lane leaves the bits of the others as they are.
+  // Back through a contact that comes to another of Mindlin's rings in some lanes: by the tape in these lanes, by the
+  // program in the others. So the bits of a lane do not depend on the others.
   void rings_back(std::size_t c, int domain, const V* history, const Trace<V>& seen) {
     recorded.clear();
     const TapedParameters parameter(forward.parameter);
@@ -736,8 +740,8 @@ struct Adjoint : AdjointLayout<Law, V> {
     share_out(pair, load_numbers<ContactInput<V>>(own_bar));
   }
 
-  // Mindlin's segments on the tape, the bars of those that the law left, and those of the former ones: their forces are `leaves`
-  // on the tape; in the lanes that `move`.
+  // `taped` puts Mindlin's segments on the tape. `seed_segments` sets the bars of those that the law left;
+  // `take_segments` reads those of the former ones, whose forces begin in slot `leaves`. Both act in the lanes `moves`.
   static std::vector<Segment<Taped>> taped(const Segment<V>* seen, int count) {
     std::vector<Segment<Taped>> all;
     for (int k = 0; k < count; ++k)
@@ -763,7 +767,7 @@ struct Adjoint : AdjointLayout<Law, V> {
     return (before < now) | (now < before);
   }
 
-  // The bars of a contact's input go to the two grains and spheres it was made from.
+  // Gives the bars of a contact's input to the two grains and spheres from which the input was made.
   void share_out(const Candidate& pair, const ContactInput<V>& bar) {
     const Vec<V> point = splat<V>(0.5) * (bar.lever_one + bar.lever_other);
     const bool away_is_one = pair.away_is_one();
@@ -838,7 +842,7 @@ struct Adjoint : AdjointLayout<Law, V> {
     }
   }
 
-  // Friction of the walls on grain u, of which the forward steps know which planes it touched in this step.
+  // Back through friction of the walls on grain u. The forward steps know the planes that it touched in this step.
   void friction_back(int step, int u, int chunk, const V* turned, const V* walls, V* turned_bar, V* of_walls) {
     for_planes(u, [&](int k, int w, const KnownPlanes& known) {
       V* const history_bar = bar_at_plane(u, k, w);
@@ -865,7 +869,7 @@ struct Adjoint : AdjointLayout<Law, V> {
     });
   }
 
-  // As `rings_back`, of a sphere at a plane; arguments as of `pull_back`.
+  // `rings_back` of a sphere at a plane; arguments as of `pull_back`.
   void plane_rings_back(const V* const* in, const V* result_bar, V* const* bar, const Segment<V>* seen, int before) {
     recorded.clear();
     const int first = recorded.mark().slots;
@@ -944,8 +948,8 @@ struct Adjoint : AdjointLayout<Law, V> {
     }
   }
 
-  // From the pressures of a step to what they were made of: the bar of the force on either wall of an axis, those of `faces`,
-  // and, added, those of the walls themselves.
+  // Back through the pressures of a step. Returns the bar of the force on either wall of an axis, sets those of
+  // `faces`, and adds those of the walls to `by_walls`.
   Vec<V> pressure_back(int step, Vec<V> pressure_bar, V* by_walls) {
     recorded.clear();
     const TapedWalls walls(forward.walls_at(step));
@@ -969,7 +973,7 @@ struct Adjoint : AdjointLayout<Law, V> {
     return load_vec(&recorded.bar(first));
   }
 
-  // The bars of the cell of a step, of which all have told theirs.
+  // Sums up the bars of the cell of a step over domains and chunks, and adds those of its walls to `by_walls`.
   void cell_back(int step, V* by_walls) {
     V bar[kCellNumbers];
     std::copy_n(earlier_bar, kCellNumbers, bar);

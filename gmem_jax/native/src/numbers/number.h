@@ -12,7 +12,7 @@
 namespace gmem {
 namespace GMEM_ISA {
 
-// How many chains of operations that wait for nothing of each other are taken along together; a GPU has threads for it.
+// How many independent chains of operations are computed side by side. On a GPU threads serve this purpose.
 #if defined(__CUDA_ARCH__)
 constexpr int kTogether = 1;
 #else

@@ -1,10 +1,10 @@
 // Reverse mode without a tape. A calculation whose operations are always the same is recorded by the compiler: with
-// `Symbol`s in place of numbers it leaves a `Program`, its operations in order, from which the compiler makes
-// straight-line code, forwards and backwards, that keeps its numbers in registers. What the calculation does is said once,
-// where it is done forwards; what a `Tape` finds, `pull_back` finds too.
+// `Symbol`s in place of numbers it leaves a `Program`, its operations in order. From these the compiler makes
+// straight-line code, forwards and backwards, that keeps its numbers in registers. The calculation is written once, in
+// the forward code. `pull_back` gives the same bars as a `Tape`.
 //
-// Comparisons are recorded as masks, and both sides of a `select` are calculated. Where the forward code looks whether any
-// lane needs a part at all (`bits_less`), a program has that part.
+// Comparisons are recorded as masks, and both sides of a `select` are calculated. Where the forward code leaves out a
+// part that no lane needs (`bits_less`), a program always has that part.
 
 #pragma once
 
@@ -36,7 +36,7 @@ enum class Step : unsigned char {
   either
 };
 
-// What becomes of the derivative ("bar") by an input: none is wanted, it is written, or it is added to what is there.
+// The use of the derivative ("bar") by an input: not wanted, written to its place, or added to the number there.
 enum class Bar : unsigned char { none, set, add };
 
 class Program {
@@ -47,7 +47,7 @@ class Program {
   struct Node {
     Step step = Step::constant;
     Bar bar = Bar::none;
-    bool active = false;  // whether anything that has a bar came into it
+    bool active = false;  // whether it depends on an input that has a bar
     short a = -1, b = -1, c = -1;
     double constant = 0.0;
   };
@@ -62,8 +62,8 @@ class Program {
   }
 };
 
-// Which bars are there when the way back comes to a node: those that nothing has reached yet need neither be set to zero nor
-// read.
+// Which bars have a value when the way back comes to a node. Bars that nothing has reached yet need neither be set to
+// zero nor read.
 struct Reached {
   bool node[Program::kCapacity] = {};        // at last
   bool seeded[Program::kMaxResults] = {};    // before a result's own bar is added
@@ -124,7 +124,7 @@ constexpr void result(Program& program, const Vec<Symbol>& a) {
   result(program, a.x), result(program, a.y), result(program, a.z);
 }
 
-// Of constants alone nothing is recorded: that is not in a constant expression, and the compiler says so.
+// An operation on constants alone cannot be recorded: it is no constant expression, and the compiler says so.
 constexpr int record(Step step, Program* program, int a, int b = -1, int c = -1) {
   Program::Node node;
   node.step = step;
@@ -179,16 +179,16 @@ constexpr Symbol select(const SymbolMask& m, const Symbol& a, const Symbol& b) {
 constexpr Symbol zero_unless(const SymbolMask& m, const Symbol& a) { return select(m, a, Symbol{}); }
 
 constexpr unsigned bits_less(const Symbol&, const Symbol&) { return 1; }
-constexpr Symbol max(const Symbol& a, const Symbol&) { return a; }  // only ever asked who is near
+constexpr Symbol max(const Symbol& a, const Symbol&) { return a; }  // its only use is whether walls are near
 
-// A calculation says what it does by a function `record`.
+// A calculation is a structure with a function `record`, which returns its program.
 template <class Calculation>
 constexpr Program program_of = Calculation::record();
 template <class Calculation>
 constexpr Reached reached_in{program_of<Calculation>};
 
-// A double's inverse root is infinite at zero, as that of a CPU's vectors is not. A `select` drops what comes of it, but on
-// the way back zero would be multiplied by it.
+// The inverse root of a double is infinite at zero; that of a CPU's vectors is not. A `select` drops it forwards, but
+// on the way back it would be multiplied by zero.
 template <class V>
 GMEM_INLINE V finite_inverse_root(V a) {
   return inverse_root(a);
@@ -261,7 +261,7 @@ GMEM_INLINE void reverse(const V* value, const Mask<V>* mask, V* bar) {
     }
     if constexpr (step == Step::root)  // at zero, where it has no derivative, zero
       to_a(zero_unless(value[n] > V{}, splat<V>(0.5) * g / value[n]));
-    if constexpr (step == Step::inverse_root)  // what is not wanted stays zero, even where its slope is infinite
+    if constexpr (step == Step::inverse_root)  // a bar of zero stays zero, even where the slope is infinite
       to_a(zero_unless(differ(g, V{}), splat<V>(-0.5) * (((g * value[n]) * value[n]) * value[n])));
     if constexpr (step == Step::select) to_a(zero_unless(mask[now.c], g)), to_b(select(mask[now.c], V{}, g));
   }

@@ -1,7 +1,7 @@
-// What the physics asks of a number, for one double: a lane of a GPU, or of a test.
+// The functions that the physics needs of a number, for one double: a lane of a GPU, or of a test.
 //
-// All that kernel.cc compiles stands in a namespace named after the instruction set: the linker must not take one set's
-// code for another's.
+// All code that kernel.cc compiles is in a namespace named after the instruction set: the linker must not take the code
+// of one set for that of another.
 
 #pragma once
 
@@ -16,7 +16,8 @@
 #endif
 
 #define GMEM_INLINE inline __attribute__((always_inline))
-// Of long functions that are called in several places; on a GPU, where what they are given stays in registers, in one.
+// For long functions that are called in several places. On a GPU they are inlined, so that their arguments stay in
+// registers.
 #if defined(__CUDACC_RTC__)
 #define GMEM_APART GMEM_INLINE
 #else
@@ -26,7 +27,7 @@
 namespace gmem {
 namespace GMEM_ISA {
 
-// What comparing two numbers gives.
+// The result of comparing two numbers.
 template <class V>
 using Mask = decltype(V{} < V{});
 

@@ -143,7 +143,8 @@ struct Pair {
   friend Pair max(Pair x, Pair y) { return {max(x.a, y.a), max(x.b, y.b)}; }
   friend Pair root(Pair x) { return {root(x.a), root(x.b)}; }
   friend unsigned bits_less(Pair x, Pair y) { return bits_less(x.a, y.a) | bits_less(x.b, y.b) << W; }
-  // What is no number comes through, as it does from one half: a bound that left out its neighbours would be too low.
+  // Not-a-number in the first half is returned, as `largest` of one half returns it: a bound without it would be too
+  // low.
   friend double largest(Pair x) {
     const double a = largest(x.a), b = largest(x.b);
     return a != a || a > b ? a : b;

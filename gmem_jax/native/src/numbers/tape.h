@@ -1,4 +1,4 @@
-// Numbers and vectors that remember how they came about: a calculation with them can be gone through backwards, from
+// Numbers and vectors whose operations are recorded on a tape: a calculation can be gone through backwards, from
 // derivatives by its results to derivatives by its arguments ("bars").
 
 #pragma once
@@ -30,7 +30,7 @@ enum class Operation : std::int32_t {
   select
 };
 
-// A mask where a number is kept.
+// A mask in the bits of a number, so that a slot can hold it.
 template <class R>
 inline R of_mask(Bits m) {
   if constexpr (std::is_same<R, Real>::value) return (Real)m;
@@ -39,7 +39,7 @@ inline R of_mask(Bits m) {
 inline Bits mask_in(Real a) { return (Bits)a; }
 inline Bits mask_in(Dual<Real> a) { return (Bits)a.value; }
 
-// What was calculated, in order. A slot holds one number.
+// The operations of a calculation, in order. A slot holds one number.
 template <class R>
 class Tape {
  public:
@@ -71,7 +71,7 @@ class Tape {
     return result;
   }
 
-  // From the bars of the last results to those of what they came from, back to `first`.
+  // Goes back from the bars of the last results to those of their operands, until `first`.
   void reverse(Mark first) {
     for (int n = nodes_ - 1; n >= first.nodes; --n) {
       const Node node = node_[n];
@@ -97,7 +97,7 @@ class Tape {
         case Operation::root:  // at zero, where it has no derivative, zero
           *a += zero_unless(*result > R{}, splat<R>(0.5) * g / *result);
           break;
-        case Operation::inverse_root: {  // what is not wanted stays zero, even where its slope is infinite
+        case Operation::inverse_root: {  // a bar of zero stays zero, even where the slope is infinite
           const R y = *result;
           *a += zero_unless(differ(g, R{}), splat<R>(-0.5) * (((g * y) * y) * y));
           break;
@@ -153,7 +153,7 @@ class Tape {
 template <class R>
 static thread_local Tape<R>* tape __attribute__((tls_model("initial-exec"))) = nullptr;
 
-// Makes it that tape for as long as this lives.
+// Makes a tape the one of this thread, as long as the object lives.
 template <class R>
 struct Recording {
   explicit Recording(Tape<R>* on) { tape<R> = on; }
@@ -205,13 +205,13 @@ struct Taped {
   friend Bits operator>(Taped a, Taped b) { return a.value > b.value; }
   friend Bits operator<=(Taped a, Taped b) { return a.value <= b.value; }
   friend unsigned bits_less(Taped a, Taped b) { return bits_less(a.value, b.value); }
-  friend Taped max(Taped a, Taped b) { return {max(a.value, b.value), 0}; }  // only ever asked who is near
+  friend Taped max(Taped a, Taped b) { return {max(a.value, b.value), 0}; }  // its only use is whether walls are near
   friend double largest(Taped a) { return largest(a.value); }
   friend double smallest(Taped a) { return smallest(a.value); }
   friend Taped floor_of(Taped a) { return {floor_of(a.value), 0}; }
 
  private:
-  // Of constants alone nothing is remembered.
+  // Operations on constants alone are not recorded.
   static GMEM_INLINE Taped of_sum(Operation operation, R value, Taped a, Taped b) {
     return {value, a.slot || b.slot ? tape<R>->push(operation, value, a.slot, b.slot) : 0};
   }
@@ -223,7 +223,7 @@ struct Taped {
   static GMEM_INLINE Taped of_root(Operation operation, R value, Taped a) {
     return {value, a.slot ? tape<R>->push(operation, value, a.slot) : 0};
   }
-  // The slot of an operand whose value will be wanted.
+  // The slot of an operand whose value the way back needs.
   GMEM_INLINE int kept() const { return slot ? slot : tape<R>->slot(value); }
 };
 
