@@ -1,4 +1,4 @@
-// What the kernels are given: plain structures that the host and the device share.
+// The arguments of the kernels: plain structures that the host and the device share.
 //
 // A lane is one replica: of B in each of the entries of the call's leading axis, L = entries times B in all. N grains
 // of K spheres have P listed candidates; a sphere is named in up to C of them.
@@ -15,8 +15,8 @@ constexpr int kItems = 32;    // grains that a block of `move` has
 constexpr int kWorkers = 4;   // threads that sum up the forces on one of them
 constexpr int kOfLayers = 6;  // numbers of Mindlin's `Layers`
 constexpr int kLoad = 6;      // numbers of a contact: the force on its first sphere, and the point where it acts
-// Of reverse mode (cuda/back.h): numbers of a grain at the beginning of a step, and midway; of `ContactInput`; those that
-// every grain has of `GrainParameters`; and the parameters that contacts have derivatives by.
+// Of reverse mode (cuda/back.h): numbers of a grain at the beginning of a step, and midway; of `ContactInput`; those
+// that every grain has of `GrainParameters`; and the parameters that contacts have derivatives by.
 // At last, those that the contacts of a sphere give to it.
 constexpr int kOfGrain = 19, kOfInput = 18, kOfConstants = 14, kOfContact = 7, kOfSphere = 12;
 
@@ -51,12 +51,12 @@ struct Divisor {
   }
 };
 
-// What a thread reads at once.
+// Four numbers that a thread reads at once.
 struct alignas(16) Four {
   int of[4];
 };
 
-// What is remembered of contacts between grains, or with walls that have friction.
+// The histories of contacts between grains, or with walls that have friction.
 struct Memories {
   Table history_in[kMaxHistory], history_out[kMaxHistory];
   // Between steps.
@@ -66,9 +66,10 @@ struct Memories {
   int* stored;                 // ... how many, [rows, L]
 };
 
-// What reverse mode has beside what the steps have. "Bar" x is the derivative of the final results by x.
+// The arrays of reverse mode beside those of the steps. "Bar" x is the derivative of the final results by x.
 struct Backwards {
-  // Bars of the results, and of the arguments but for fields and histories, which take the place of these in `Arguments`.
+  // Bars of the results, and of the arguments but for fields and histories, which take the place of these in
+  // `Arguments`.
   Table fields_in[kFields], pressure_in, history_in[kMaxHistory];
   Table parameters_out, walls_out, offsets_out;
   // Kept of every step:
@@ -77,7 +78,7 @@ struct Backwards {
   double* history;  // of candidates that touch in it, at its beginning, [T, P, numbers of the law, L]
   // Of the step that is gone back through:
   double* middle;   // bars of the grains midway, with those of force and torque, [N, kOfGrain, L]
-  double* input;    // bars of what contacts are found from, if they touch, [P, kOfInput, L]; forwards `load` lies here
+  double* input;    // bars of `ContactInput` of contacts that touch, [P, kOfInput, L]; forwards `load` lies here
   double* at_wall;  // bars of the walls by grains that touch them, [N, kWalls, L]
   // Sums over steps, in the end over all grains or candidates:
   double* of_grains;    // bars of their constants and of the spheres' places in them, [N, kOfConstants + 3 K, L]
@@ -89,7 +90,7 @@ struct Arguments {
   int grains, spheres, rows, columns, points, steps;  // N, K, P, C, Q, T
   int replicas, lanes;                                // B, L
   Divisor by_replicas, by_lanes, by_spheres;
-  int periodic;  // bit of each axis along which the box is
+  int periodic;  // a bit for each axis along which the box is periodic
   bool isotropic, tangent;
   Entries<const int> first, second;     // spheres of a candidate, [P]
   Entries<const unsigned char> valid;   // [P]
@@ -114,11 +115,11 @@ struct Arguments {
                             // [P + N K, L]
   Backwards back;           // where that is wanted
 
-  // Of `many`, each of kChunk.
+  // How many chunks of kChunk hold `many` items.
   static int chunks(int many) { return (many + kChunk - 1) / kChunk; }
 };
 
-// Those from `take` on are of reverse mode, which has neither `collect` nor `leave`.
+// Kernels from `take` on are of reverse mode, which has neither `collect` nor `leave`.
 enum class GpuKernel {
   enter,
   remember,

@@ -1,11 +1,13 @@
-// Reverse mode on a GPU. The steps go forwards and keep what the way back needs (`keeps` in step.h); then each step is gone
-// back through in three launches. In `touch_back` a thread is one candidate of one lane; in `gather_back` one sphere, which
-// sums up what its contacts found; in `move_back` one grain, which goes back through the first half of the step, and through
-// the second half of the step before. The calculations are those of the CPU, as programs (physics/calculations.h); here stands only who gets which
-// derivative. "Bar" x is the derivative of the final results by x.
+// Reverse mode on a GPU. The steps go forwards and keep the numbers that the way back needs (`keeps` in step.h). Then
+// each step is gone back through in three launches. In `touch_back` a thread has one candidate of one lane. In
+// `gather_back` it has one sphere, and sums up the bars from its contacts. In `move_back` it has one grain, and goes
+// back through the first half of the step and the second half of the step before. A fourth launch, `collect_walls`,
+// sums up bars of the walls. The calculations are those of the CPU, as programs (physics/calculations.h). This file
+// only passes derivatives on. "Bar" x is the derivative of the final results by x.
 //
-// Bars of grains and histories lie where the results of the call are. Those of what all share - parameters, places of
-// spheres, walls - are added up by grains and candidates, and these sums in a fixed order at the end.
+// Bars of grains and histories lie where the results of the call are. Bars of numbers that all grains share
+// (parameters, places of spheres, walls) are added up for each grain and candidate, and these sums are added in a fixed
+// order at the end.
 
 #pragma once
 
@@ -41,11 +43,11 @@ constexpr bool gives_no_others() {
 
 inline void add(const Column<double>& to, int row, double more) { to.put(row, to[row] + more); }
 
-// Rows that a grain has in the sums over steps.
+// How many rows a grain has in the sums over steps.
 inline int of_grain(const Arguments& a) { return kOfConstants + 3 * a.spheres; }
 
-// The bars of the results, as those that the way back begins with; and sums of nothing. Thread of candidate or grain, and
-// lane.
+// Copies the bars of the results, with which the way back begins, and sets the sums to zero. One thread for each lane
+// of a candidate or grain.
 template <class Law>
 void take(const Arguments& a, int thread) {
   const ReplicaView<double> on(a, thread);
@@ -70,7 +72,7 @@ void take(const Arguments& a, int thread) {
   for (int row = 0; row < of_grain(a); ++row) sums.put(of_grain(a) * item + row, 0.0);
 }
 
-// Back through a contact of a step, if it touched in it. Thread of candidate and lane.
+// Back through a contact of a step, if it touched in that step. One thread for each lane of a candidate.
 template <class Law>
 void touch_back(const Arguments& a, int step, int thread) {
   using Calculation = OneContact<Law>;
@@ -90,7 +92,8 @@ void touch_back(const Arguments& a, int step, int thread) {
   const Column<double> sphere = on.in(a.sphere), hot = on.in(a.hot);
   const Vec<double> here = sphere.vec(3 * one), there = sphere.vec(3 * other), gap = there - here;
   if (!bits_less(dot(gap, gap), 4.0)) {
-    // A contact apart has a blank history, whatever it was before. The bars of the results may be other than zero for all.
+    // A contact apart has a blank history, whatever it was before. The bars of the results may be other than zero for
+    // all.
     if (!touching && step + 1 < a.steps) return;
     for (int n = 0; n < Law::kHistory; ++n)
       history_bar(n, [](const Column<double>& bars, int at) { return bars.put(at, 0.0); });
@@ -124,11 +127,11 @@ void touch_back(const Arguments& a, int step, int thread) {
   for (const int of : kLawRowOfContact) add(sums, sum++, law_bar[of]);
 }
 
-// What the contacts of a sphere give to it and to its grain, summed in the order of its list.
+// The bars that the contacts of a sphere give to it and to its grain, summed in the order of its list.
 enum Given { kGivenCentre = 0, kGivenPosition = 3, kGivenVelocity = 6, kGivenSpin = 9 };
 static_assert(cuda::kOfSphere == kGivenSpin + 3, "spheres are given other numbers");
 
-// Thread of sphere and lane.
+// One thread for each lane of a sphere.
 inline void gather_back(const Arguments& a, int thread) {
   const ReplicaView<double> on(a, thread);
   if (on.item >= a.grains * a.spheres) return;
@@ -156,14 +159,15 @@ inline Grain<double> kept_grain(const ReplicaView<double>& on, int step) {
   return load_numbers<Grain<double>>(number);
 }
 
-// A grain's constants, and their bars by one launch.
+// A grain's constants, and the bars that one launch adds to theirs.
 struct Constants {
   GrainParameters<double> are;
   double number[kGrainNumbers], bar[kGrainNumbers];
 };
 
-// Back through the walls on a sphere, if it touches them: adds to the bars of how the grain is `turned`, of the sphere's
-// place `body` in it, and of the walls.
+// Back through the centre of a sphere, and through the walls if it touches them. Adds to the bars of the grain midway
+// with its rotation matrix (`turned`), of the sphere's place `body` in the grain, and of the walls. Returns whether it
+// touches.
 GMEM_INLINE bool sphere_back(const ReplicaView<double>& on, int sphere, const HalfStep<double>& half,
                              const WallState<double>& box, const double* turned, const double* body,
                              Vec<double> centre_bar, Constants& constants, double* turned_bar, double* body_bar,
@@ -178,7 +182,7 @@ GMEM_INLINE bool sphere_back(const ReplicaView<double>& on, int sphere, const Ha
     pull_back<OneSphere<false>>(in, result_bar, bar);
     return false;
   }
-  // The pressures are the sum of those by each sphere's forces on the walls.
+  // The pressures are sums, over spheres, of the pressure by each sphere's forces on the walls.
   const Vec<double> lever = centre - half.position;
   WallForces<double> found{};
   touch_walls(constants.are, centre, lever, add_cross(half.velocity, half.spin, lever), box, found);
@@ -222,7 +226,8 @@ GMEM_INLINE void begin_back(const ReplicaView<double>& on, int step, Constants& 
                            walls_bar);
     for (int q = 0; q < 3; ++q) add(sums, of_grain(a) * on.item + kOfConstants + 3 * k + q, body_bar[q]);
   }
-  // The byte of its first sphere, which nothing else asks for on the way back, says whether there are bars of the walls.
+  // The byte of its first sphere, which nothing else asks for on the way back, says whether there are bars of the
+  // walls.
   a.touching[on.of_lane(a.rows + on.item * a.spheres)] = touches;
   for (int q = 0; touches && q < kWalls; ++q) on.lane_of(a.back.at_wall).put(kWalls * on.item + q, walls_bar[q]);
   double own[kState];
@@ -232,7 +237,7 @@ GMEM_INLINE void begin_back(const ReplicaView<double>& on, int step, Constants& 
   pull_back<StepBegin<>>(in, turned_bar, bar);
 }
 
-// Back through the second half of a step of a grain, which is brought to its middle again.
+// Back through the second half of a step of a grain, after the grain is brought to the middle of the step again.
 GMEM_INLINE void end_back(const ReplicaView<double>& on, int step, Constants& constants, const double* state_bar) {
   const Arguments& a = on.a;
   const Grain<double> from = kept_grain(on, step);
@@ -248,8 +253,8 @@ GMEM_INLINE void end_back(const ReplicaView<double>& on, int step, Constants& co
   for (int q = 0; q < kMid; ++q) middle.put(kMid * on.item + q, mid_bar[q]);
 }
 
-// Back through the beginning of a step, if there is one of that number, and through the end of the step before. Thread of
-// grain and lane.
+// Back through the beginning of a step, if there is one of that number, and through the end of the step before. Thread
+// of grain and lane.
 inline void move_back(const Arguments& a, int step, int thread) {
   const ReplicaView<double> on(a, thread);
   if (on.item >= a.grains) return;
@@ -270,7 +275,8 @@ inline void move_back(const Arguments& a, int step, int thread) {
   for (int q = 0; q < kOfConstants; ++q) add(sums, of_grain(a) * on.item + q, constants.bar[q]);
 }
 
-// The bars of the walls of a step, summed over a chunk of grains. Thread of chunk and number of the walls, and lane.
+// Sums the bars of the walls of a step over a chunk of grains. One thread for each lane of a chunk and number of the
+// walls.
 inline void collect_walls(const Arguments& a, int step, int thread) {
   const ReplicaView<double> on(a, thread);
   const int chunk = on.item / kWalls, row = on.item % kWalls, chunks = Arguments::chunks(a.grains);
@@ -282,8 +288,8 @@ inline void collect_walls(const Arguments& a, int step, int thread) {
   on.lane_of(a.back.of_walls).put(kWalls * (step * chunks + chunk) + row, total);
 }
 
-// Sums over a chunk of those that are `stride` apart, in the place of its first: of grains, and of candidates. Thread of chunk
-// and row, and lane.
+// Sums over a chunk of those that are `stride` apart, in the place of its first: of grains, and of candidates. Thread
+// of chunk and row, and lane.
 inline void sum_up(const Arguments& a, int stride, int thread) {
   const ReplicaView<double> on(a, thread);
   const auto sum = [&](double* array, int rows, int many, int item) {
@@ -299,7 +305,7 @@ inline void sum_up(const Arguments& a, int stride, int thread) {
   sum(a.back.of_contacts, kOfContact, a.rows, on.item - of_grains);
 }
 
-// The bars of the parameters, from those of what was made of them.
+// The bars of the parameters, from those of the numbers that were made of them.
 inline void parameters_back(const ReplicaView<double>& on) {
   const Arguments& a = on.a;
   const Column<double> of_grains = on.lane_of(a.back.of_grains), of_contacts = on.lane_of(a.back.of_contacts);
@@ -317,8 +323,8 @@ inline void parameters_back(const ReplicaView<double>& on) {
   for (int row = 0; row < kRows; ++row) out.put(row, row < kParameters ? parameter_bar[row] + direct[row] : 0.0);
 }
 
-// Sums, to the results of the call. Thread of what has them - all parameters, a number of a sphere's place, or one of the walls
-// of a step - and lane.
+// Sums, to the results of the call. Thread of what has them - all parameters, a number of a sphere's place, or one of
+// the walls of a step - and lane.
 inline void leave_back(const Arguments& a, int thread) {
   const ReplicaView<double> on(a, thread);
   if (on.item == 0) return parameters_back(on);

@@ -45,7 +45,7 @@ int cuda_of_driver() {
 
 using Program = void*;
 
-// NVRTC, as far as it is used: the first that there is whose cubins the driver loads.
+// The functions of NVRTC that are used, of the first NVRTC found whose cubins the driver loads.
 struct Nvrtc {
   int (*create)(Program*, const char*, const char*, int, const char* const*, const char* const*);
   int (*compile)(Program, int, const char* const*);
@@ -102,8 +102,9 @@ const Nvrtc& nvrtc() {
   return only;
 }
 
-// What NVRTC compiles for, that `architecture` may run it: that itself, or where NVRTC does not know it the newest older
-// one, "compute_90", whose PTX the driver compiles. Throws where there is none, or the driver's PTX is too old.
+// The target for which NVRTC compiles so that `architecture` can run the code: `architecture` itself, or, where NVRTC
+// does not know it, the newest older one, as "compute_90", whose PTX the driver compiles. Throws where there is none,
+// or where the driver is too old for the PTX.
 std::string target_for(const std::string& architecture) {
   const int wanted = std::atoi(architecture.substr(architecture.find('_') + 1).c_str());
   int older = 0;
@@ -143,7 +144,7 @@ std::string kept(const std::string& path) {
   return code + checksum(code) == file ? code : "";
 }
 
-// Processes may do so at once. What cannot be kept is compiled again next time.
+// Keeps code in a file. Several processes may do so at once. Code that cannot be kept is compiled again next time.
 void keep(const std::string& path, const std::string& code) {
   std::error_code unable;
   std::filesystem::create_directories(paths().cache, unable);
@@ -205,7 +206,7 @@ std::string compiled(const std::string& target, const Which& which, std::string*
   throw std::runtime_error("NVRTC does not compile the kernels for " + target + ": " + first);
 }
 
-// What `say` returns, or its exception and 1.
+// Copies the text of `say` to `said` and returns 0; if `say` throws, copies the exception's text and returns 1.
 template <class Say>
 int in_one_line(char* said, int size, const Say& say) {
   std::string text;
@@ -273,7 +274,8 @@ extern "C" int gmem_cuda_missing(const char* architecture, char* said, int size)
   });
 }
 
-// For a test: 0 if the kernels of a `gmem::Task` compile; what the assembler says of them, or why they do not, in `said`.
+// For a test: 0 if the kernels of a `gmem::Task` compile; what the assembler says of them, or why they do not, in
+// `said`.
 extern "C" int gmem_cuda_compile(const char* architecture, int law, int variant, int task, char* said, int size) {
   return gmem::cuda::in_one_line(said, size, [&] {
     std::string log;

@@ -1,7 +1,7 @@
 // XLA's custom call on a GPU: finds the arrays, and puts the kernels of all steps into XLA's stream without waiting.
 //
-// Arrays have one leading axis, of size one or of the full size. What is needed between steps comes as further results,
-// so that XLA knows of all memory and may keep the launches as a graph.
+// Arrays have one leading axis, of size one or of the full size. Arrays that are needed between steps are further
+// results, so that XLA knows of all memory and may keep the launches as a graph.
 
 #include <algorithm>
 #include <cstdint>
@@ -23,9 +23,9 @@ namespace ffi = xla::ffi;
 constexpr int kFew = 1 << 17;
 constexpr int kOfPack = 8;  // arguments that belong to a pack
 
-// Beside the letters of call/signature.h: columns of the incidence C, candidates and spheres A, numbers of a cold grain O,
-// of a load E, of a sphere at the walls X, of `Layers` Y, derivatives and values D, lanes L. Of reverse mode: numbers that
-// are kept of a grain M, of a history H, sums of a grain J, chunks of grains G.
+// Beside the letters of call/signature.h: columns of the incidence C, candidates and spheres A, numbers of a cold grain
+// O, of a load E, of a sphere at the walls X, of `Layers` Y, derivatives and values D, lanes L. Of reverse mode:
+// numbers that are kept of a grain M, of a history H, sums of a grain J, chunks of grains G.
 // gmem_jax/native/cuda.py: call_kernels, between_steps
 Wants arguments_of(Task task, Law law, bool rubs) {
   const Wants pack = {{"first spheres", "P", ffi::S32},
@@ -81,7 +81,7 @@ Which which_of(Task task, int64_t law, int64_t variant, int64_t points, int64_t 
   return {static_cast<Law>(law), static_cast<Variant>(variant), task, periodic != 0, unequal != 0, rubs != 0};
 }
 
-// The steps, with what reverse mode keeps of them or without.
+// Launches the steps; in reverse mode their kernels keep the numbers that the way back needs.
 void launch_steps(const Launcher& launch, const Arguments& a, bool rubs) {
   const int spheres = a.grains * a.spheres;
   launch(GpuKernel::enter, a.grains, a);

@@ -1,5 +1,5 @@
-// The kernels of one law, GMEM_LAW, in numbers of one kind, GMEM_NUMBER; compiled at run time, see compile.cc. With GMEM_BACK
-// those of reverse mode: the steps, which keep what the way back needs, and the way back.
+// The kernels of one law, GMEM_LAW, in numbers of one kind, GMEM_NUMBER; compiled at run time, see compile.cc. With
+// GMEM_BACK they are those of reverse mode: steps that keep the numbers that the way back needs, and the way back.
 
 #if GMEM_BACK
 #include "cuda/back.h"

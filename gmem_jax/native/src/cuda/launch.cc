@@ -84,7 +84,7 @@ const Kernels* kernels_of(Handle context, const Which& which) {
   Kernels kernels{};
   const auto load = [&](bool anew) {
     const std::string code = code_for(architecture, which, anew);
-    // Where the call was not initialized, the stream may be on its way into a graph: loading is no part of that.
+    // Where the call was not initialized, the stream may be in capture for a graph, to which loading must not belong.
     int mode = kRelaxed;
     d.must(d.exchange_mode(&mode), "mode of capture");
     Handle module = nullptr;

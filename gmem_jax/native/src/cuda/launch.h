@@ -15,7 +15,7 @@ class Launcher {
   ~Launcher();
   Launcher(const Launcher&) = delete;
 
-  // Items in every lane, one thread each; for `move` more. Does not wait.
+  // Launches a kernel for `items` items in every lane, with one thread for each, or kWorkers in `move`. Does not wait.
   void operator()(GpuKernel kernel, int items, const Arguments& arguments, int step = 0) const;
 
  private:

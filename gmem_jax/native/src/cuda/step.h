@@ -1,10 +1,11 @@
 // The time step on a GPU: two launches, `touch` and `move`.
 //
-// In `touch` a thread is one candidate, or one sphere and the walls, of one lane: it finds the forces where they touch. In
-// `move` it is one grain of one lane: it sums up the forces on it, sphere after sphere, ends this step and begins the next. Where there are few
-// grains and lanes the sums are shared out to kWorkers threads. Nothing races, and a lane's numbers depend neither on other
-// lanes nor on how threads share the work. `enter` and `remember` copy from the arrays of the call, `leave` to them. For V =
-// double, or numbers that carry a derivative, whose results are the derivatives alone.
+// In `touch` a thread has one candidate, or one sphere and the walls, of one lane: it finds the forces where they
+// touch. In `move` a thread has one grain of one lane: it sums up the forces on the grain, sphere after sphere, ends
+// this step and begins the next. Where there are few grains and lanes, kWorkers threads share these sums. Nothing
+// races, and a lane's numbers depend neither on other lanes nor on how threads share the work. `enter` and `remember`
+// copy from the arrays of the call, `leave` copies to them. V is double, or numbers that carry a derivative; then only
+// derivatives are results.
 
 #pragma once
 
@@ -59,7 +60,7 @@ inline double result(Dual<double> a) { return a.slope; }
 inline bool is_zero(double a) { return a == 0.0; }
 inline bool is_zero(Dual<double> a) { return a.value == 0.0 && a.slope == 0.0; }
 
-// What one thread has to do: its item - a candidate, a grain - and its lane, one replica.
+// The work of one thread: its item (a candidate, a sphere, a grain) and its lane, one replica.
 template <class V>
 struct ReplicaView {
   const Arguments& a;
@@ -88,7 +89,7 @@ struct ReplicaView {
     }
   }
 
-  // Of a periodic box at the end of a step, or before the first.
+  // The periodic box at the end of a step, or, if `step` is negative, before the first step.
   Cell<V> cell(int step) const {
     if (step >= 0) return Cell<V>::of(a.periodic, walls(step));
     const Column<V> edges = in(a.parameters);
@@ -121,7 +122,7 @@ struct Segments {
   void forget() const { *stored = 0; }
   void remember() const {}
 
-  // From rings up to `outer`, of which `ring(j)` reads one.
+  // Makes the segments from the rings up to `outer`; `ring(j)` reads ring j.
   template <class Ring>
   Layers<V> load(int outer, double lacking, const Ring& ring) const {
     Flat<V> previous{};
@@ -138,7 +139,7 @@ struct Segments {
     return layers;
   }
 
-  // All rings of a contact that reaches to `outer`, to `put(j, f)`.
+  // Calls `put(j, f)` for all rings of a contact whose outermost ring is `outer`.
   template <class Put>
   void unload(const Layers<V>& layers, int outer, const Put& put) const {
     int next = 0;
@@ -173,7 +174,7 @@ Segments<V> segments_of(const ReplicaView<V>& on, const Memories& kept, int row)
   return {at, kept.stored + on.of_lane(row), on.a.points};
 }
 
-// Of the spheres of a pack in which they differ: the radius of one, and the size of a grain.
+// The size of a grain and the radius of a sphere, in a pack whose spheres differ in radius.
 template <class V>
 double size_of(const ReplicaView<V>& on, int grain) {
   return on.a.sizes.of(on.entry)[grain];
@@ -236,7 +237,8 @@ GrainParameters<V> read_parameters(const ReplicaView<V>& on, V* parameter) {
   return GrainParameters<V>(parameter);
 }
 
-// A history of those in `kept`, from the arrays of the call, if it is `listed` there; whether it has anything.
+// Copies history `row` of `kept` from the arrays of the call, or zeros unless it is `listed`. Returns whether it
+// differs from zero.
 template <class V, class Law>
 bool remember(const ReplicaView<V>& on, const Memories& kept, int row, bool listed) {
   const Arguments& a = on.a;
@@ -264,7 +266,7 @@ bool remember(const ReplicaView<V>& on, const Memories& kept, int row, bool list
   return remembers;
 }
 
-// Thread of candidate, or of sphere at walls that have friction, and lane.
+// One thread for each lane of a candidate, or of a sphere at walls that have friction.
 template <class V, class Law, bool rubs>
 void remember(const Arguments& a, int thread) {
   const ReplicaView<V> on(a, thread);
@@ -278,7 +280,7 @@ void remember(const Arguments& a, int thread) {
   }
 }
 
-// Grains, from the arrays of the call. Thread of grain and lane.
+// Copies grains from the arrays of the call and begins the first step. One thread for each lane of a grain.
 template <class V, bool periodic, bool unequal, bool keeps = false>
 void enter(const Arguments& a, int thread) {
   const ReplicaView<V> on(a, thread);
@@ -302,7 +304,7 @@ void enter(const Arguments& a, int thread) {
   begin<V, periodic, unequal>(on, 0, constants, from);
 }
 
-// What is remembered of a contact while it is computed.
+// The history of a contact while the contact is computed.
 template <class V, class Law>
 struct Memory {
   const ReplicaView<V>& on;
@@ -332,7 +334,8 @@ struct Memory {
   }
 };
 
-// Friction of the walls on a sphere; returns the planes that it touches. `known` are those that it remembers.
+// Friction of the walls on a sphere; returns bits of the planes that it touches. `known` are those where it has a
+// history.
 template <class V, class Law>
 unsigned rub_planes(const ReplicaView<V>& on, const GrainParameters<V>& constants, const V* parameter, int number,
                     Vec<V> centre, Vec<V> lever, Vec<V> velocity, Vec<V> spin, const WallState<V>& box, V radius,
@@ -390,13 +393,14 @@ void touch_walls(const ReplicaView<V>& on, int step, int number) {
         rub_planes<V, Law>(on, constants, parameter, number, centre, lever, velocity, spin, box, radius, touching));
 }
 
-// What a contact at a point is found from; the numbers of its grains begin in rows i and j.
+// The input of a contact at `point`; the numbers of its grains begin in rows i and j of `hot`.
 template <class V>
 GMEM_INLINE ContactInput<V> meeting(const Column<V>& hot, int i, int j, Vec<V> gap, Vec<V> point) {
   return {gap, point - hot.vec(i), point - hot.vec(j), hot.vec(j + 3) - hot.vec(i + 3), hot.vec(i + 6), hot.vec(j + 6)};
 }
 
-// The forces between the spheres of a candidate, or of the walls on a sphere. Thread of candidate or sphere, and lane.
+// The forces between the spheres of a candidate, or of the walls on a sphere. One thread for each lane of a candidate
+// or sphere.
 template <class V, class Law, bool periodic, bool unequal, bool rubs, bool keeps = false>
 void touch(const Arguments& a, int step, int thread) {
   const ReplicaView<V> on(a, thread);
@@ -457,12 +461,12 @@ void touch(const Arguments& a, int step, int thread) {
   if (!touched) touching = 1;
 }
 
-// What acts on a grain.
+// Force and torque on a grain.
 template <class V>
 struct Load {
   Vec<V> force, torque;
-  Vec<V> through;  // the faces of a periodic box, of contacts in which it is the first
-  Vec<V> rubbed;   // what of the force is friction of the walls
+  Vec<V> through;  // force through the faces of a periodic box, of contacts in which the grain is the first
+  Vec<V> rubbed;   // the part of the force that is friction of the walls
 };
 
 template <class V>
@@ -495,7 +499,7 @@ GMEM_INLINE void for_touching(const ReplicaView<V>& on, int number, const Each& 
     }
     for (int q = 0; q < 4; ++q)
       if (touching[q]) each(row[q], second[q]);
-    if (static_cast<unsigned>(now.of[3]) >= 2u * rows) break;  // those that follow are blank, too
+    if (static_cast<unsigned>(now.of[3]) >= 2u * rows) break;  // the columns that follow are blank, too
   }
 }
 
@@ -580,8 +584,8 @@ void move_alone(const Arguments& a, int step, int thread) {
   move<V, periodic, unequal, keeps>(on, step, sum);
 }
 
-// Sums of pressures over a chunk of spheres that are `stride` apart, in the place of its first. Thread of chunk and axis,
-// and lane.
+// Sums of pressures over a chunk of spheres that are `stride` apart, written in the place of its first sphere. One
+// thread for each lane of a chunk and axis.
 template <class V>
 void collect(const Arguments& a, int stride, int thread) {
   const ReplicaView<V> on(a, thread);
@@ -594,7 +598,7 @@ void collect(const Arguments& a, int stride, int thread) {
   wall.put(a.of_wall * first + 3 + axis, total);
 }
 
-// What is not yet in the arrays of the call of a history of those in `kept`.
+// Copies the part of history `row` of `kept` that is not yet in the arrays of the call.
 template <class V, class Law>
 void leave(const ReplicaView<V>& on, const Memories& kept, int row) {
   const Arguments& a = on.a;
@@ -616,7 +620,8 @@ void leave(const ReplicaView<V>& on, const Memories& kept, int row) {
   }
 }
 
-// Pressures and histories, to the arrays of the call. Thread of axis, candidate, or sphere at walls that have friction, and lane.
+// Copies pressures and histories to the arrays of the call. One thread for each lane of an axis, of a candidate, or of
+// a sphere at walls that have friction.
 template <class V, class Law, bool rubs>
 void leave(const Arguments& a, int thread) {
   const ReplicaView<V> on(a, thread);
