@@ -89,7 +89,7 @@ struct AdjointLayout {
   V* faces;            // [steps, 2, 3]: sections of periodic boxes, and forces through their faces
   V* domain_cell_bar;  // [domains, kCellNumbers], of one step
   V* chunk_cell_bar;   // [chunks, 2, kCellNumbers], of the cell in that step and of the one before
-  // Where walls have friction: histories at walls at the beginning of each step, the planes where they are not 0, and
+  // Where walls have friction: the histories there at the beginning of each step, the planes where they are not 0;
   // bars.
   V* wall_history;        // [steps, N, wall_rows, kHistory]
   unsigned char* planes;  // [steps, S], bits
@@ -176,8 +176,7 @@ struct Adjoint : AdjointLayout<Law, V> {
   const bool general;
   Tape<V> recorded;
   V law_numbers[kLawNumbers], grain_numbers[kGrainNumbers], wall_law_numbers[kWallLawNumbers], last_ring;
-  // Of the step that is gone back through: its cell, the numbers of that cell and of the one before, and the bars of
-  // `faces`.
+  // Of the step that is gone back through: its cell, the numbers of this cell and of the one before; bars of `faces`.
   Cell<V> cell;
   V cell_numbers[kCellNumbers], before_numbers[kCellNumbers], faces_bar[6];
   V earlier_bar[kCellNumbers] = {};  // of the cell before those steps that were gone back through already
@@ -409,8 +408,7 @@ struct Adjoint : AdjointLayout<Law, V> {
     team.barrier();
   }
 
-  // In the bars of one history: from the bars of rings to those of the layers and segments that hold them after the
-  // last step.
+  // In one history: from the bars of rings to those of the layers and segments that hold the rings after the last step.
   void to_layers(V* history, const StoredSegments<V>& segments, V outer) {
     for (int q = kLayers; q < Law::kHistory; ++q) history[q] = V{};
     for (int part = 0; part < kParts; ++part) {
@@ -656,8 +654,7 @@ struct Adjoint : AdjointLayout<Law, V> {
     for (int n = 0; n < kContactConstants; ++n) to[n] = splat<V>(constant[n]);
   }
 
-  // Goes back through the program, from the bars of its results to those of the contact's own numbers and of the
-  // parameters.
+  // Back through the program, from the bars of its results to those of the contact's own numbers and of the parameters.
   void contact_back(std::size_t c, int domain, const ContactInput<V>& input, const V* history, const V* result_bar,
                     V* own_bar) const {
     V own[kNumbers], *const parameter_bar = of_domain(domain);

@@ -166,8 +166,7 @@ struct Constants {
 };
 
 // Back through the centre of a sphere, and through the walls if it touches them. Adds to the bars of the grain midway
-// with its rotation matrix (`turned`), of the sphere's place `body` in the grain, and of the walls. Returns whether it
-// touches.
+// with its rotation matrix (`turned`), of the sphere's place `body` in the grain, and of walls. Returns if it touches.
 GMEM_INLINE bool sphere_back(const ReplicaView<double>& on, int sphere, const HalfStep<double>& half,
                              const WallState<double>& box, const double* turned, const double* body,
                              Vec<double> centre_bar, Constants& constants, double* turned_bar, double* body_bar,
@@ -200,7 +199,7 @@ GMEM_INLINE bool sphere_back(const ReplicaView<double>& on, int sphere, const Ha
   return true;
 }
 
-// Back through the first half of a step of a grain.
+// Back through the first half of a step of a grain, with its spheres and their contacts with the walls.
 GMEM_INLINE void begin_back(const ReplicaView<double>& on, int step, Constants& constants, double* state_bar) {
   const Arguments& a = on.a;
   const Grain<double> from = kept_grain(on, step);

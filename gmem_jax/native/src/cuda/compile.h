@@ -1,5 +1,4 @@
-// The kernels are compiled for a kind of GPU by NVRTC, while the program runs. No GPU, driver or nvcc is needed for
-// that.
+// The kernels are compiled for a kind of GPU by NVRTC, while the program runs. This needs no GPU, driver or nvcc.
 
 #pragma once
 

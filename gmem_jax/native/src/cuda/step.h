@@ -237,8 +237,7 @@ GrainParameters<V> read_parameters(const ReplicaView<V>& on, V* parameter) {
   return GrainParameters<V>(parameter);
 }
 
-// Copies history `row` of `kept` from the arrays of the call, or zeros unless it is `listed`. Returns whether it
-// differs from zero.
+// Copies history `row` of `kept` from the call's arrays, or zeros unless it is `listed`. Returns if it differs from 0.
 template <class V, class Law>
 bool remember(const ReplicaView<V>& on, const Memories& kept, int row, bool listed) {
   const Arguments& a = on.a;
@@ -334,8 +333,7 @@ struct Memory {
   }
 };
 
-// Friction of the walls on a sphere; returns bits of the planes that it touches. `known` are those where it has a
-// history.
+// Friction of the walls on a sphere; returns bits of the planes it touches. `known` are those where it has a history.
 template <class V, class Law>
 unsigned rub_planes(const ReplicaView<V>& on, const GrainParameters<V>& constants, const V* parameter, int number,
                     Vec<V> centre, Vec<V> lever, Vec<V> velocity, Vec<V> spin, const WallState<V>& box, V radius,

@@ -143,8 +143,7 @@ struct Pair {
   friend Pair max(Pair x, Pair y) { return {max(x.a, y.a), max(x.b, y.b)}; }
   friend Pair root(Pair x) { return {root(x.a), root(x.b)}; }
   friend unsigned bits_less(Pair x, Pair y) { return bits_less(x.a, y.a) | bits_less(x.b, y.b) << W; }
-  // Not-a-number in the first half is returned, as `largest` of one half returns it: a bound without it would be too
-  // low.
+  // Not-a-number in the first half is returned, as from one half alone: a bound without it would be too low.
   friend double largest(Pair x) {
     const double a = largest(x.a), b = largest(x.b);
     return a != a || a > b ? a : b;
