@@ -293,7 +293,7 @@ def locked(output: Path, taken: str = "") -> Iterator[None]:
     try:
         known = os.fstat(handle)
         if not stat.S_ISREG(known.st_mode) or known.st_size:
-            raise FileFormatError(f"{lock}: is in the place of a lock, and none of ours; move it away")
+            raise FileFormatError(f"{lock}: is not a lock file of gmem, but has the name of one; move it away")
         if not _lock(handle) or not lock.exists() or known.st_ino != lock.stat().st_ino:
             # The process that held it has removed it meanwhile, and another may have made a new one.
             raise FileFormatError(taken or f"{output}: another run is writing it; name another output")

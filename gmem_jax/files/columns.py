@@ -59,7 +59,7 @@ def read_columns(path: Path) -> SampleTable:
     _require_names(path, names, values, rows)
     axes = [place for place, name in enumerate(names) if _AXIS.fullmatch(name)]
     if len(axes) > 1 or len(axes) == len(values):
-        raise FileFormatError(f"{path}: {', '.join(names)}: must be one axis, and a column for each signal")
+        raise FileFormatError(f"{path}: columns {', '.join(names)}: need one axis (u or time) and one signal or more")
     _require_no_axis(path, names, values, axes)
     if not axes:
         return SampleTable(values, said=said)

@@ -68,7 +68,7 @@ def check_frames(frames: Frames) -> None:
     if rubbed is not None:
         require_finite({"frames/wall_friction": rubbed})
         require(rubbed.shape[1] == count, "the friction of its walls is not of all spheres")
-    require(len(frames.time) == frames.count > 0, "its frames and their stages are not of one number")
+    require(len(frames.time) == frames.count > 0, "its frames must have one stage each, and there must be a frame")
     require(count > 0, "its frames hold no spheres")
     require(frames.lower < frames.upper, "a frame has a lower wall that is not below the upper one")
     require(np.abs(np.linalg.norm(frames.quaternion, axis=-1) - 1.0) < 1e-9, "a frame has a quaternion not of length 1")
@@ -76,7 +76,7 @@ def check_frames(frames: Frames) -> None:
     require(whole_list and np.all(np.diff(start) >= 0), "the contacts of its frames are not one after the other")
     in_range = (spheres[:, 0] >= 0) & (spheres[:, 1] < count)
     apart = spheres[:, 0] // per_grain < spheres[:, 1] // per_grain
-    require(in_range & apart, "a contact of its frames is none of two grains")
+    require(in_range & apart, "a contact of its frames is not between two of its grains")
 
 
 def load_frames(path: Path) -> Frames | None:

@@ -100,7 +100,7 @@ def _check_clump(found: Found, isotropic: bool) -> None:
     require(
         np.all(triangle) and 0.999 * least < second < most, "the moments of inertia are not those of the grain's mass"
     )
-    require(not isotropic or np.ptp(inertia) < 1e-3 * inertia.mean(), "the grain is not isotropic as it says")
+    require(not isotropic or np.ptp(inertia) < 1e-3 * inertia.mean(), "the moments of a grain marked isotropic differ")
 
 
 def _check_box(found: Found) -> None:

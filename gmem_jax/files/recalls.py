@@ -52,7 +52,7 @@ def save_recall(path: str | Path, recall: Recall) -> None:
     configuration = recall.configuration
     if not configuration:
         raise ValueError(
-            "a recall of a traced experiment does not say what it is of: save recall.described(gm.describe(experiment))"
+            "a recall of a traced experiment has no configuration: save recall.described(gm.describe(experiment))"
         )
     names = np.asarray([name.encode() for name in recall.names])
     if names.dtype.itemsize == 1:
@@ -136,9 +136,9 @@ def _check(recall: Recall) -> None:
     status = np.asarray(recall.status)
     require(
         signals > 0 and replicas == signals + 1,
-        f"it has {plural(signals, 'signal')} and {plural(replicas, 'replica')}, not one more",
+        f"it has {plural(signals, 'signal')} and {plural(replicas, 'replica')}, must have one replica more",
     )
-    require((status >= 0) & (status & ~_EVERY_BIT == 0), "its status is none that there is")
+    require((status >= 0) & (status & ~_EVERY_BIT == 0), "its status has bits that gm.Status does not have")
     require(np.abs(np.asarray(recall.u) - bin_centres()) < 1e-12, "its u are not the centres of bins")
     require_finite({name: getattr(recall, name) for name in ("J", "window", "dt")})
     require(

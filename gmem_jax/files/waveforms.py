@@ -185,7 +185,7 @@ def signals_from_dict(written: Mapping[str, Any]) -> Signals:
     kind = written.get("kind")
     if "sha256" in written:
         raise ValueError(
-            f"waveforms of the class {kind}, which is not the library's, are told by a hash and cannot be made from it"
+            f"waveforms of the class {kind}, which the library lacks, are stored only as a hash; make them in Python"
         )
     require_kinds(written)
     makers: dict[str, Callable[..., Signals]] = {**NAMED, **SIGNALS}
@@ -277,7 +277,7 @@ def _one_set(
         raise ValueError(f'--signals {name}: must be "six", "words:L" or a .csv or .npy file')
     made = waveform(load_waveforms(Path(name), told=told, **done))
     if Path(name).suffix.lower() == ".csv" and load_target(Path(name)) is not None:
-        told(f"{name}: designed to be recalled as others; gmem recall compares with these too, all else with its own J")
+        told(f"{name}: holds designed waveforms and their target; only gmem recall compares with the target, too")
     return made
 
 

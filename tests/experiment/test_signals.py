@@ -297,7 +297,7 @@ class Series:
 def test_waveforms_of_one_s_own_are_told_by_a_hash_and_not_made_from_it():
     written = signals_to_dict(Series(jnp.ones((3, 3)), jnp.ones(3)))
     assert set(written) == {"kind", "sha256"}
-    with pytest.raises(ValueError, match="waveforms of the class Series, which is not the library's"):
+    with pytest.raises(ValueError, match="waveforms of the class Series, which the library lacks"):
         signals_from_dict(written)
 
 

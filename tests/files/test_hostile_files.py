@@ -201,7 +201,7 @@ def test_a_recall_keeps_its_waveforms_and_their_names_and_is_refused_when_its_pa
     for change, words in (
         (lambda file: put(file, "p_sig", file["p_sig"][:1]), r"'p_sig' has shape \[1, 256\]"),
         (lambda file: put(file, "fidelity", np.asarray(np.nan)), "fidelity holds numbers that are not finite"),
-        (lambda file: put(file, "status", file["status"][()] + (1 << 20)), "its status is none that there is"),
+        (lambda file: put(file, "status", file["status"][()] + (1 << 20)), "its status has bits that gm.Status"),
         (lambda file: file.__delitem__("stages/readout"), "the stage 'readout' is missing"),
         (lambda file: file.attrs.modify("configuration", "{}"), "its configuration has no 'pack'"),
     ):

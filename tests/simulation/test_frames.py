@@ -172,7 +172,7 @@ def test_a_file_gives_frames_back(filmed: gm.Recall, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "refusal"),
     [
-        ({"spheres": lambda a: a + 200}, "none of two grains"),
+        ({"spheres": lambda a: a + 200}, "not between two of its grains"),
         ({"start": lambda a: a[::-1]}, "one after the other"),
         ({"time": lambda a: a[:-1]}, "has shape"),
         ({"quaternion": lambda a: 2.0 * a}, "not of length 1"),
