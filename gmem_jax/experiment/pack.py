@@ -101,7 +101,7 @@ def find_pairs(clump: Clump, position: np.ndarray, quaternion: np.ndarray, box: 
         ValueError: if the grains have sizes, and their number differs from that of the grains.
     """
     if clump.sizes is not None and len(clump.sizes) != len(position):
-        raise ValueError(f"a pack of {len(position)} grains needs as many sizes, its grain has {len(clump.sizes)}")
+        raise ValueError(f"a pack of {len(position)} grains needs a size for each grain, got {len(clump.sizes)} sizes")
     smallest = smallest_box(np.asarray(box.lower)[:, 0], np.asarray(box.upper)[:, 0], delta0)
     still = jnp.zeros((*np.shape(position), 1))
     grains = Grains(jnp.asarray(position)[..., None], jnp.asarray(quaternion)[..., None], still, still, still, still)
@@ -158,7 +158,7 @@ def stack(packs: Sequence[Pack]) -> Pack:
                 f"{first.clump.shape}, {pack.name} has {pack.grains} {pack.clump.shape}"
             )
         if any((one is None) != (other is None) for one, other in zip(*map(_unequal, (first, pack)), strict=True)):
-            raise ValueError(f"packs to be stacked must have sizes all or none: {first.name} and {pack.name} differ")
+            raise ValueError(f"either all packs of a stack have sizes, or none: {first.name} and {pack.name} differ")
         if pack.periodic != first.periodic:
             raise ValueError(
                 f"packs to be stacked must have one boundary: {first.name} has {boundary_of(first.periodic)}, "

@@ -66,7 +66,7 @@ WARNINGS = (
 
 
 SENTENCES = {
-    Status.STALE_PAIRS: "grains moved further than the neighbour list bears; gm.run makes it anew, or use a smaller dt",
+    Status.STALE_PAIRS: "grains moved too far for their neighbour list; gm.run renews the list, or use a smaller dt",
     Status.OUTSIDE_BOX: "a grain left the box; use a smaller dt, or check where the grains of the pack lie",
     Status.NOT_FINITE: "a position or a force is not a finite number; use a smaller dt, or check pack and friction law",
     Status.NOT_AT_REST: "grains still move when the readout begins; use a longer store or a larger hold_drag",
@@ -75,10 +75,10 @@ SENTENCES = {
     Status.IMPOSSIBLE: "a parameter or a waveform is impossible; use numbers that `Experiment` accepts outside a trace",
     Status.DEEP_OVERLAP: "an overlap exceeded 0.2 R, and Hertz's law is for small ones; use a smaller delta0 or gamma0",
     Status.NOT_QUASI_STATIC: "the walls move too fast (inertial number above 5e-3); use a larger t0 or smaller gamma0",
-    Status.RINGING: "the pack rings: F over its period is larger by more than 0.03; use a larger t0, or F over T1",
+    Status.RINGING: "the pack rings: F averaged over T1 exceeds F by more than 0.03; use a larger t0, or that average",
     Status.SHEAR_BEYOND_COMPRESSION: "the shear exceeds delta0 / 4, where the gain depends on it; use a smaller gamma0",
     Status.LARGE_WAVEFORM: "a waveform exceeds 2, and gains are per gamma0; use waveforms up to 1 and a larger gamma0",
-    Status.LARGE_FRICTION: "a friction coefficient exceeds 10, as of no material; use a smaller mu or wall_mu",
+    Status.LARGE_FRICTION: "a friction coefficient exceeds 10, which no material has; use a smaller mu or wall_mu",
     Status.LARGE_STIFFNESS: "tangential springs are stiffer than Hertz contacts; use stiffness < 1.5 normal_stiffness",
     Status.RESTLESS: "steps look unstable (fast grains or strong dampers); use a smaller dt, damping_time or hold_drag",
     Status.ROUNDED: "round-off is 1 % of p_sig or more; use a larger gamma0, or precision double if it was mixed",

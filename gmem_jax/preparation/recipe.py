@@ -126,7 +126,7 @@ class Recipe:
         if self.sizes and self.size_spread:
             raise ValueError("sizes and size_spread exclude each other: grains are a mixture, or are spread")
         if self.shares and not self.sizes:
-            raise ValueError("shares are those of sizes: name the sizes, too")
+            raise ValueError("shares are the fractions of grains of each size: give sizes, too")
         self.drawn_sizes()
 
     def drawn_sizes(self) -> np.ndarray | None:

@@ -233,7 +233,7 @@ class Stage:
         if self.of is not None and self.role != "read":
             refuse("only a stage that reads is compared with another")
         if self.role == "read" and not self.recorded:
-            refuse("what is read is recorded")
+            refuse("its role is read, so it must be recorded; leave out recorded=False")
         if self.pressure is not None:
             if len(pressure) != 3 or not all(p is None or 0.0 < p < math.inf for p in pressure):
                 refuse(f"its pressure is three numbers above 0 or none, for x, y and z; got {self.pressure}")

@@ -104,7 +104,7 @@ def test_a_file_whose_sizes_were_changed_is_refused(tmp_path: Path) -> None:
 
 
 def test_packs_with_and_without_sizes_are_not_stacked() -> None:
-    with pytest.raises(ValueError, match="must have sizes all or none"):
+    with pytest.raises(ValueError, match="either all packs of a stack have sizes, or none"):
         stack([replace(PACK, clump=replace(PACK.clump, shape=EQUAL.clump.shape)), EQUAL])
     assert stack([PACK, PACK]).clump.sizes.shape == (2, 27)
 

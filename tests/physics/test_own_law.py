@@ -89,7 +89,7 @@ for kind in (Scalar, Sticky, Remembering, Counting, Alone, Single, Flat, Growing
         (Scalar(), r"Scalar returned a force float64\[7, 1, 3\]; it must be \[P, 3, B\], here float64\[7, 3, 3\]"),
         (Sticky(), "Sticky returned a force where kin.touching is False; it must be exactly 0 there"),
         (Undefined(), "Undefined returned a force where kin.touching is False"),
-        (Remembering(), "Remembering returned a history where kin.touching is False that is not the one of its init"),
+        (Remembering(), "Remembering must return the history of its init where kin.touching is False"),
         (Counting(), r"Counting.init returned a history with int64\[7, 1, 3\]; all of it must be numbers of the dtype"),
         (Flat(), r"Flat.init returned a history with float64\[3, 3, 7\]; .* \[contacts, ..., replicas\]"),
         (Alone(), r"Alone must return a tangential force and a history, got float64\[7, 3, 3\]"),

@@ -339,7 +339,7 @@ def test_impossible_radii_are_refused_in_a_line(radii, said: str) -> None:
 def test_a_pack_has_a_size_for_each_grain_or_none() -> None:
     pack = gm.load_pack(TETRA_27)
     few = replace(pack, clump=sized(pack.clump, np.full(26, 1.01)))
-    with pytest.raises(ValueError, match="a pack of 27 grains needs as many sizes, its grain has 26"):
+    with pytest.raises(ValueError, match="a pack of 27 grains needs a size for each grain, got 26"):
         gm.pack_from(few, position=pack.position, quaternion=pack.quaternion)
 
 

@@ -60,7 +60,7 @@ def test_a_mixture_has_its_shares() -> None:
         (lambda: gm.mixture(10, [1.0, 1.4], [0.99, 0.01]), "of 10 grains none would have size 1.4"),
         (lambda: gm.Recipe(size_spread=0.6), r"size_spread must be in \[0, 0.35\]"),
         (lambda: gm.Recipe(size_spread=0.1, sizes="1,1.4"), "sizes and size_spread exclude each other"),
-        (lambda: gm.Recipe(shares="0.5,0.5"), "shares are those of sizes"),
+        (lambda: gm.Recipe(shares="0.5,0.5"), "shares are the fractions of grains of each size"),
         (lambda: gm.Recipe(sizes="1;1.4"), "sizes must be numbers with commas between them"),
         (lambda: gm.Recipe(sizes="1,-1.4"), "sizes must be positive numbers"),
         (lambda: gm.Recipe(sizes="1,1.4", shares="0.5"), "shares must be one for each of 2 sizes"),

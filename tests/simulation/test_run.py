@@ -210,7 +210,7 @@ def test_a_traced_recall_tells_a_stale_list_from_a_grain_outside_and_a_step_too_
     def said(position: jax.Array, t0: float = 60.0) -> str:
         return gm.explain(combined_status(recall(position, t0).status))
 
-    assert "gm.run makes it anew" in said(PACK.position.at[0].add(0.2))
+    assert "gm.run renews the list" in said(PACK.position.at[0].add(0.2))
     assert "a grain left the box" in said(PACK.position.at[0, 2].add(20.0))
     assert "is not a finite number" in said(PACK.position.at[0, 2].set(jnp.nan))
     assert "the time step, t0 / (256 steps), exceeds 2 t_c; use more steps" in said(PACK.position, 600.0)

@@ -42,7 +42,7 @@ def require_law(law: FrictionLaw, replicas: int) -> None:
             raise ValueError(f"{_name(law)} returned a force where kin.touching is False; it must be exactly 0 there")
         if not all(map(np.array_equal, jax.tree.leaves(left), jax.tree.leaves(blank))):
             raise ValueError(
-                f"{_name(law)} returned a history where kin.touching is False that is not the one of its init"
+                f"{_name(law)} must return the history of its init where kin.touching is False; it returned another"
             )
 
 
