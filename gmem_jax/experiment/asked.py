@@ -140,7 +140,7 @@ def require_slow_creep(friction: FrictionLaw, creep: Scalar | None, fades: Scala
     """
     if creep is None:
         if fades is not None:
-            raise ValueError("creep_fades says when creep becomes slower, and there is none: give creep, a rate")
+            raise ValueError("creep_fades is a time after which creep slows, and creep is missing: give creep, a rate")
         return
     if not isinstance(friction, RelaxingLaw):
         raise ValueError(f"creep: {type(friction).__name__} has no elastic forces that could relax")
@@ -170,15 +170,15 @@ def require_memory(protocol: Protocol, background: str) -> None:
         raise ValueError("the protocol writes no waveforms of the replicas, as gm.write() does")
     if background != "sub0" and len(protocol.reads) != 2:
         raise ValueError(
-            f"background {background!r} takes the second read for the background of the first; the protocol has "
+            f"background {background!r} needs two reads, the second for the background of the first; the protocol has "
             f"{len(protocol.reads)}"
         )
     if background != "sub0":
         first, second = (protocol.stage(name) for name in protocol.reads)
         if first.ends != second.ends:
             raise ValueError(
-                f"background {background!r} takes the second read for the background of the first; {first.name!r} goes "
-                f"from u = {first.ends[0]:g} to {first.ends[1]:g}, and {second.name!r} from {second.ends[0]:g} to "
+                f"background {background!r} needs two reads over the same u; {first.name!r} goes from u = "
+                f"{first.ends[0]:g} to {first.ends[1]:g}, and {second.name!r} from {second.ends[0]:g} to "
                 f"{second.ends[1]:g}"
             )
         if background == "sub2-bl" and first.moves and set(first.ends) != {0.0, 1.0}:

@@ -236,14 +236,14 @@ class Experiment:
         protocol = paper if given is None else given.with_sets(names)
         if protocol is None:
             raise ValueError(
-                f"the sets of waveforms are {', '.join(names)}, and the paper's protocol writes those that are called "
-                f"like a channel, {', '.join(CHANNELS)}: give a protocol that says what is written when"
+                f"the paper's protocol writes sets of waveforms named after a channel, {', '.join(CHANNELS)}; "
+                f"there are {', '.join(names)}: rename them, or give a protocol with stages that write them"
             )
         if protocol != paper:
             odd = [name for name in OF_PAPER if getattr(self, name) != _DEFAULTS[name]]
             if odd:
                 raise ValueError(
-                    f"{odd[0]} makes the paper's protocol, and another one was given: say it in a stage of that"
+                    f"{odd[0]} belongs to the paper's protocol, and another is given: set it in a stage of the other"
                 )
             require_memory(protocol, self.background)
         if protocol.columns.friction and not isinstance(self.friction, CoulombLaw | Frictionless):

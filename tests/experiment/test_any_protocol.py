@@ -94,7 +94,7 @@ def test_what_makes_no_protocol_is_refused(reason: str, stages: tuple[Any, ...])
         ({"drag": -1.0}, r"drag must be in \[0, inf\)"),
         ({"pressure": (0.0, None, None)}, "three numbers above 0 or none"),
         ({"of": "write"}, "only a stage that reads"),
-        ({"role": "read", "recorded": False}, "what is read is recorded"),
+        ({"role": "read", "recorded": False}, "so it must be recorded"),
         ({"name": "a/b"}, "without '/'"),
         ({"name": "."}, "not '.'; got '.'"),
         ({"name": "x" * 200}, "a name of 1 to 150 printable letters"),
@@ -124,8 +124,8 @@ def test_what_makes_no_drive_is_refused(arguments: tuple[Any, ...], reason: str)
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
-        ({"store": 1.0}, "store makes the paper's protocol, and another one was given"),
-        ({"background": "sub2"}, "takes the second read for the background of the first; the protocol has 1"),
+        ({"store": 1.0}, "store belongs to the paper's protocol, and another is given"),
+        ({"background": "sub2"}, "needs two reads, the second for the background of the first; the protocol has 1"),
         (
             {"protocol": gm.protocols.partial_readout(to=0.5), "background": "sub2"},
             "'read-part' goes from u = 1 to 0.5, and 'read-again' from 1 to 0",
@@ -143,7 +143,7 @@ def test_what_makes_no_drive_is_refused(arguments: tuple[Any, ...], reason: str)
         ({"protocol": gm.Protocol(gm.write([0.5, 1.0, 0.5]), gm.read())}, "writes no waveforms of the replicas"),
         ({"protocol": gm.Protocol(gm.write("first"), gm.read())}, "writes 'first', and the sets of waveforms are xy"),
         ({"protocol": READ.stages}, "must be a gm.Protocol, got a tuple"),
-        ({"protocol": None, "signals": gm.signals(first=ONE, second=ONE)}, "give a protocol that says what is written"),
+        ({"protocol": None, "signals": gm.signals(first=ONE, second=ONE)}, "give a protocol with stages"),
         ({"protocol": None, "signals": gm.signals(xy=ONE, z=ONE)}, "alike in all replicas"),
     ],
 )
