@@ -76,9 +76,9 @@ def _require_one_fidelity(experiment: Experiment) -> None:
     reads, channels = experiment.readings.reads, experiment.readings.channels
     if len(reads) * len(channels) > 1 or len(experiment.sets) > 1:
         raise InputError(
-            f"this takes one set of waveforms with one F, and the protocol has reads {', '.join(reads)}, channels "
-            f"{', '.join(channels)} and sets {', '.join(experiment.sets)}; in the library gm.value_and_grad "
-            "differentiates any loss, and gm.kernel_matrix and gm.design_waveforms know channels"
+            f"this command needs one read, one channel and one set of waveforms; there are reads {', '.join(reads)}, "
+            f"channels {', '.join(channels)} and sets {', '.join(experiment.sets)}; in the library gm.value_and_grad "
+            "differentiates any loss, and gm.kernel_matrix and gm.design_waveforms take several channels"
         )
 
 
@@ -221,7 +221,7 @@ def _needs_sub0(experiment: Experiment, what: str) -> None:
 def _require_designable(experiment: Experiment) -> None:
     _needs_sub0(experiment, "designs are made")
     if experiment.shear != "during":
-        raise InputError(f"--shear {experiment.shear}: designs are of what is encoded during the compression")
+        raise InputError(f"--shear {experiment.shear}: designs need shear during the compression; use --shear during")
 
 
 @with_experiment
@@ -286,7 +286,7 @@ def design_command(
     _require_one_fidelity(experiment)
     _require_designable(experiment)
     if chosen.target(experiment.signals.count) is not None:
-        raise InputError("--signals: these were designed, and are to be recalled as others; --start goes on from them")
+        raise InputError("--signals: these are designed waveforms; give the wanted ones, and these as --start to go on")
     if start is not None:
         if not start.is_file():
             raise InputError(f"--start {start}: is no file of waveforms")
@@ -352,7 +352,7 @@ def parse_bounds(text: str) -> dict[str, tuple[float, float]]:
         except ValueError:
             raise InputError(f"--bounds: {item!r} should read like mu=0.5:2") from None
     if unknown := set(bounds) - set(PARAMETERS):
-        raise InputError(f"--bounds: {min(unknown)!r} is none of {', '.join(PARAMETERS)}")
+        raise InputError(f"--bounds: {min(unknown)!r} cannot be tuned; {', '.join(PARAMETERS)} can")
     return bounds
 
 

@@ -118,7 +118,7 @@ def reproduce_command(
     print_result(as_json, result, *lines, *more, *map(_table, outcomes))
     broken += weighed.failed + [reason for outcome in outcomes for reason in outcome.failed]
     if broken:
-        raise RunFailedError(f"{len(broken)} of the points and packs; again with --retry")
+        raise RunFailedError(f"{len(broken)} of the points and packs failed; try them again with --retry")
 
 
 def _say_cost(what: str, scale: str, output: Path, workers: int, as_json: bool) -> None:

@@ -76,14 +76,14 @@ def show(
             raise InputError(f"{file}: --{name} is for the folder of a sweep")
     found = summary_of(file, against, chosen, each=each, **axes)
     if each and found.csv is None:
-        raise InputError(f"{file}: --each tells of each recalled signal, and this is no recall")
+        raise InputError(f"{file}: --each gives the measures of each recalled signal; name the file of a recall")
     if plot:
         _draw(file, found.figures, plot, output, force, as_json)
     elif output is not None:
         raise InputError(f"--output {output}: say what to draw with --plot, one of {', '.join(found.figures)}")
     elif csv:
         if found.csv is None:
-            raise InputError(f"{file}: --csv gives recalled signals, and this is no recall")
+            raise InputError(f"{file}: --csv gives recalled signals; name the file of a recall")
         with heard():
             sys.stdout.write(found.csv(each=each))
     else:

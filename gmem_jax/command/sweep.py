@@ -69,7 +69,7 @@ def sweep_command(
     if what in VERBS:
         refuse_idle(f"with {what}: it runs no points", "executor", "workers", "retry")
         if what != "show":
-            refuse_idle(f"with {what}; it is of show", "over")
+            refuse_idle(f"with {what}; use it with gmem sweep show", "over")
         if what != "export":
             refuse_idle(f"with {what}, which writes no file", "output", "force")
         if folder is None:
@@ -86,8 +86,8 @@ def sweep_command(
         return
     if folder is not None and Path(what).suffix == ".toml":
         raise InputError(f"{folder}: does nothing after a sweep file; name its folder with -o {folder}")
-    refuse_idle("where a sweep is done: it goes on in its folder and replaces nothing", "force")
-    refuse_idle("where a sweep is done; gmem sweep show FOLDER --over has it", "over")
+    refuse_idle("when a sweep runs: a sweep goes on in its folder and replaces nothing", "force")
+    refuse_idle("when a sweep runs; use it with gmem sweep show FOLDER", "over")
     path = Path(what)
     if path.suffix != ".toml":
         raise InputError(f"{what}: neither a sweep file (.toml) nor one of {', '.join(VERBS)}")
@@ -121,7 +121,7 @@ def sweep_command(
     log(f"{count - len(failed)} of {plural(count, 'point')} in {target}; gmem sweep show {target}")
     print_result(as_json, sweep_facts(runner.store, table), points_table(table, spec.names))
     if failed:
-        raise RunFailedError(f"{len(failed)} of {plural(count, 'point')}; again with --retry")
+        raise RunFailedError(f"{len(failed)} of {plural(count, 'point')} failed; try them again with --retry")
 
 
 def planned(path: Path, spec: Spec, folder: Path) -> SweepRunner:

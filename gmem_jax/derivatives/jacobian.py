@@ -68,7 +68,7 @@ def _one_signal(experiment: Experiment) -> tuple[Bumps, np.ndarray]:
     for name, path in LAW.items():
         value = getattr(experiment.friction, path.removeprefix("friction."), None)
         if not isinstance(value, float | jax.Array):
-            raise ValueError(f"a Jacobian is by mu and stiffness, and {name} is no number of the friction law {law}")
+            raise ValueError(f"a Jacobian needs a friction law with the numbers mu and stiffness; {law} has no {name}")
     return bumps, np.asarray(bumps.amplitudes)
 
 

@@ -295,8 +295,8 @@ def written_sets(experiment: Experiment) -> tuple[str, ...]:
     names = {str(drive.waveform): None for drive in written.values() if not drive.fixed}
     if len(reads) > 1 or len(names) < len(channels):
         raise ValueError(
-            f"this needs one read, and for each channel a set of waveforms; there are {plural(len(reads), 'read')}, "
-            f"and on {' and '.join(channels)} is written {' and '.join(names) or 'nothing'}"
+            f"kernels need one read, and a set of waveforms for each channel; the protocol has "
+            f"{plural(len(reads), 'read')}, and writes {' and '.join(names) or 'nothing'} on {' and '.join(channels)}"
         )
     return tuple(str(written[channel].waveform) for channel in channels)
 

@@ -80,7 +80,7 @@ def axes_of(rows: Rows, names: Sequence[str], x: str = "", by: Sequence[str] = (
         if name not in names:
             raise ValueError(f"{name}: does not vary here; {', '.join(names)} do")
         if chosen.count(name) > 1:
-            raise ValueError(f"{name}: is to be two of --x, --by and --over; choose one")
+            raise ValueError(f"{name}: is named twice in --x, --by and --over; name it in one of them")
     free = [name for name in varying if name not in chosen]
     if not x:
         numbers = [name for name in free if all(is_number(row[name]) for row in rows)]

@@ -87,7 +87,7 @@ def test_tune_stays_within_bounds_and_says_what_it_found(
         ("mu", "should read like mu=0.5:2"),
         ("mu=1", "should read like mu=0.5:2"),
         ("mu=a:b", "should read like mu=0.5:2"),
-        ("colour=1:2", "'colour' is none of"),
+        ("colour=1:2", "'colour' cannot be tuned"),
         ("mu=2:3", "hold the first value 1, got 2 to 3"),
         ("mu=0.5:2,mu=0.9:1", "mu is given twice"),
         ("stiffness=0.1:40", "with the highest values of the bounds: dt = "),
@@ -146,9 +146,9 @@ def test_a_recall_of_designed_waveforms_is_compared_with_their_target_too(
     assert (
         gmem(monkeypatch, "gradient", PACK, "--signals", waves, "-o", tmp_path / "g.json", *SHORT, "--no-picture") == 0
     )
-    assert "designed to be recalled as others" in capsys.readouterr().err
+    assert "holds designed waveforms and their target" in capsys.readouterr().err
     assert gmem(monkeypatch, "design", PACK, "--signals", waves, "-o", tmp_path / "d.csv", *SHORT) == 2
-    assert "--start goes on from them" in capsys.readouterr().err
+    assert "these as --start to go on" in capsys.readouterr().err
     gm.save_waveforms(waves, own, gm.words(1))
     assert gmem(monkeypatch, "recall", PACK, "-o", tmp_path / "no.h5", "--signals", waves, *SHORT) == 2
     assert "its target has 2 signals, must have 6" in capsys.readouterr().err

@@ -79,7 +79,7 @@ REFUSED = {
     "must be a .toml file": ["--protocol", "mine"],
     "no such file": ["--protocol", "other.toml"],
     "exists; name another": ["--protocol", "mine.toml", "-o", "there.h5"],
-    "takes one set of waveforms with one F, and the protocol has reads read, read-2": ["--protocol", "two.toml"],
+    "needs one read, one channel and one set of waveforms; there are reads read, read-2": ["--protocol", "two.toml"],
 }
 
 

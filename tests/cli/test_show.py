@@ -175,13 +175,13 @@ def test_what_lies_along_the_axis_of_a_sweep_can_be_chosen(
     [
         (["swept", "--plot", "gain", "--x", "colour", "-o", "x.png"], "colour: does not vary here; mu do"),
         (["recall.h5", "--x", "mu"], "--x is for the folder of a sweep"),
-        (["pack.h5", "--each"], "this is no recall"),
+        (["pack.h5", "--each"], "name the file of a recall"),
         (["recall.h5", "--plot", "colour", "-o", "x.png"], "there are signals, waveforms, all, pressure"),
         (["recall.h5", "--plot", "Z"], "name the picture with -o, as in -o Z.png"),
         (["recall.h5", "--plot", "Z", "-o", "x.h5"], "must end in one of .png, .svg, .pdf"),
         (["recall.h5", "--against", "v"], "must be one of time, u"),
         (["recall.h5", "-o", "x.png"], "say what to draw with --plot"),
-        (["pack.h5", "--csv"], "this is no recall"),
+        (["pack.h5", "--csv"], "name the file of a recall"),
         (["nothing.json"], "no such file"),
     ],
 )

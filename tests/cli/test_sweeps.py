@@ -48,7 +48,7 @@ def swept(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     assert done.returncode == 1, done.stderr
     assert "failed: mu = None, background = None" in done.stderr
-    assert "1 of 5 points; again with --retry" in done.stderr
+    assert "1 of 5 points failed; try them again with --retry" in done.stderr
     assert re.search(r"grain-steps, some \d+ s of two free cores once compiled", done.stderr)
     table = json.loads(done.stdout)
     assert (table["done"], table["failed"], table["open"]) == (4, 1, 0)

@@ -283,7 +283,7 @@ def test_a_jacobian_of_another_background_is_refused(experiment: gm.Experiment, 
     [
         ({"gamma0": jnp.full(2, 1e-3)}, "at one value of each parameter, not one for each replica"),
         ({"friction.mu": np.full(2, 0.5)}, "at one value of each parameter, not one for each replica"),
-        ({"friction": gm.Frictionless()}, "mu is no number of the friction law Frictionless"),
+        ({"friction": gm.Frictionless()}, "the numbers mu and stiffness; Frictionless has no mu"),
     ],
 )
 def test_a_jacobian_by_what_there_is_not_is_refused(experiment: gm.Experiment, changes: Any, said: str) -> None:

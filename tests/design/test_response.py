@@ -192,7 +192,7 @@ def test_a_gain_that_no_waveform_has_is_refused_before_anything_runs(
 def test_designs_of_what_is_read_twice_are_refused(experiment: gm.Experiment) -> None:
     again = gm.Experiment(experiment.pack, experiment.signals, t0=75.0, protocol=gm.protocols.partial_readout())
     with pytest.raises(
-        ValueError, match="this needs one read, and for each channel a set of waveforms; there are 2 reads"
+        ValueError, match="kernels need one read, and a set of waveforms for each channel; the protocol has 2 reads"
     ):
         gm.design_waveforms(again)
     with pytest.raises(ValueError, match=r"of one channel; gm.design_waveforms designs several together"):

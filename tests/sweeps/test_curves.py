@@ -39,7 +39,7 @@ def test_what_goes_together_with_the_axis_makes_no_lines() -> None:
     ("chosen", "problem"),
     [
         ({"x": "colour"}, "colour: does not vary here; prepare.seed, mu, gamma0, pack do"),
-        ({"x": "mu", "over": ["mu"]}, "mu: is to be two of --x, --by and --over"),
+        ({"x": "mu", "over": ["mu"]}, "mu: is named twice in --x, --by and --over"),
         ({"x": "mu", "by": ["prepare.seed"]}, "gamma0: varies too"),
     ],
 )
