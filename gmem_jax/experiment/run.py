@@ -171,7 +171,7 @@ def run(
     require_host("gm.run", experiment)
     schedule = frame_schedule(experiment, frames, frames_of, frames_at)
     if prefix and schedule.wanted:
-        raise ValueError("frames begin with the prefix: run it in the same call")
+        raise ValueError("frames begin with the prefix, which was run before: leave out the argument prefix")
     warn_of_another_preparation(experiment)
     common, own = experiment.phases
     firsts = range(0, count, size)
@@ -286,8 +286,8 @@ def _warn_of_another_material(experiment: Experiment) -> None:
     if odd := [name for name in made if not np.allclose(np.asarray(getattr(experiment.material, name)), made[name])]:
         others = ", ".join(f"{name} = {made[name]:g}, not {said(getattr(experiment.material, name))}" for name in odd)
         warn_caller(
-            f"{pack.name} was prepared with {others}: it is not at rest so; take its own, as in "
-            "material=gm.Material(...), or prepare a pack with these"
+            f"{pack.name} was prepared with {others}: it is not at rest with the new values; use those of its "
+            "preparation, as in material=gm.Material(...), or prepare a pack with the new ones"
         )
 
 
@@ -301,8 +301,8 @@ def other_weight(experiment: Experiment) -> str:
     if own <= 0.0 or np.allclose(np.asarray(gravity), own, atol=0.0):
         return ""
     return (
-        f"{pack.name} was prepared under gravity = {own:g}, not {said(gravity)}: it is not at rest so; "
-        f"take its own, gravity = {own:g}, or prepare a pack for this one"
+        f"{pack.name} was prepared under gravity = {own:g}, not {said(gravity)}: it is not at rest with the new "
+        f"value; use gravity = {own:g}, or prepare a pack with the new one"
     )
 
 

@@ -165,7 +165,7 @@ def test_another_delta0_than_the_packs_own_warns(pack: gm.Pack) -> None:
 def test_another_material_than_the_packs_own_warns(pack: gm.Pack) -> None:
     soft = gm.Experiment(pack, two_bumps(jnp.ones((1, 2))), material=gm.Material(wall_rigidity=0.5), **SHORT)
     with pytest.warns(
-        UserWarning, match=r"tetra-27 was prepared with wall_rigidity = 1, not 0\.5: it is not at rest so"
+        UserWarning, match=r"tetra-27 was prepared with wall_rigidity = 1, not 0\.5: it is not at rest with the new"
     ):
         gm.run(soft)
     with warnings.catch_warnings():
