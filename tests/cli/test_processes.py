@@ -30,7 +30,7 @@ PACK = TETRA_27
 ENTRY = "from gmem_jax.command.app import main; main()"
 LONG = f"""[experiment]
 pack = "{PACK}"
-t0 = 18000
+t0 = 180000
 [vary]
 mu = [0.2, 1.0]
 [run]
