@@ -64,11 +64,8 @@ def main() -> None:
             number = drawn(2**bits, arguments.drawn)
             if there(folder / TABLE, name, bits, len(number), arguments.t0, arguments.iterations):
                 continue
-            kept = folder / f"words-{bits}-seed-0.msgpack"
-            trained = training.train_net(TrainingConfig(bits), 0, budget=arguments.budget, checkpoint=kept)
-            if not trained.finished:
-                print(f"net of {bits} bits: out of time, held-out accuracy {trained.validation:.4f}", flush=True)
-            row = design(folder, any_words, kernel, bits, number, trained.net, arguments.iterations)
+            net = net_of(bits, folder, arguments.budget)
+            row = design(folder, any_words, kernel, bits, number, net, arguments.iterations)
             print(row, flush=True)
             note(folder / TABLE, list(row), [row])
             draw(folder / TABLE, folder / "words.png")
@@ -78,6 +75,15 @@ def drawn(count: int, most: int) -> np.ndarray:
     """Numbers of the words that are drawn: at most `most` of `count`."""
     every = np.arange(count)
     return every if count <= most else np.sort(np.random.default_rng(count).choice(every, most, replace=False))
+
+
+def net_of(bits: int, folder: Path, budget: float) -> Net:
+    """The paper's net for words of this length, which a folder keeps; training it takes up to `budget` seconds."""
+    kept = folder / f"words-{bits}-seed-0.msgpack"
+    trained = training.train_net(TrainingConfig(bits), 0, budget=budget, checkpoint=kept)
+    if not trained.finished:
+        print(f"net of {bits} bits: out of time, held-out accuracy {trained.validation:.4f}", flush=True)
+    return trained.net
 
 
 def design(

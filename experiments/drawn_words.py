@@ -22,15 +22,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from console import in_one_line, say
-from design_words import drawn
+from design_words import drawn, net_of
 
 import gmem_jax as gm
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.record import key_of_run
 from gmem_jax.experiment.signals import bin_average
 from gmem_jax.files.checkpoints import Checkpoints
-from gmem_jax.reading import training
-from gmem_jax.reading.lessons import TrainingConfig
 from gmem_jax.reading.net import Net, accuracy
 from gmem_jax.reading.readers import nearest_template
 from gmem_jax.reproduce.compare import write_csv
@@ -72,11 +70,8 @@ def main() -> None:
         recall = gm.load_recall(file)
         if recall.configuration["experiment"] != gm.describe(experiment)["experiment"]:
             parser.error(f"{file}: is of another experiment; name another folder")
-        kept = folder / f"words-{bits}-seed-0.msgpack"
-        trained = training.train_net(TrainingConfig(bits), 0, budget=arguments.budget, checkpoint=kept)
-        if not trained.finished:
-            print(f"net of {bits} bits: out of time, held-out accuracy {trained.validation:.4f}", flush=True)
-        row = {"pack": pack.name, "t0": arguments.t0, **read(experiment, recall, bits, number, trained.net)}
+        net = net_of(bits, folder, arguments.budget)
+        row = {"pack": pack.name, "t0": arguments.t0, **read(experiment, recall, bits, number, net)}
         print(row, flush=True)
         rows = sorted([row, *(other for other in rows if other["bits"] != bits)], key=lambda one: int(one["bits"]))
         write_csv(table, rows)
@@ -136,11 +131,8 @@ def over_packs(rows: list[Row]) -> list[Row]:
     return found
 
 
-def draw(rows: list[Row], path: Path, grains: int | None = None) -> None:
-    """Draw F with three backgrounds, and accuracies, against L beside the published; means if there are several packs.
-
-    If the number of grains is not given, it is taken from the name of the pack.
-    """
+def draw(rows: list[Row], path: Path, grains: int) -> None:
+    """Draw F with three backgrounds, and accuracies, against L beside the published; means over packs."""
     rows = over_packs(rows)
     lengths = np.array([int(row["bits"]) for row in rows])
     theirs = published("binary_words.csv")
@@ -168,9 +160,8 @@ def draw(rows: list[Row], path: Path, grains: int | None = None) -> None:
         f"{words} of {', '.join(bits)} bits on {'one pack' if packs == 1 else f'{packs} packs'}"
         for (words, packs), bits in alike.items()
     )
-    size = int(str(rows[0]["pack"]).split("-")[1]) if grains is None else grains
     figure.suptitle(
-        f"Drawn words ({counts}), N = {size:,}, $t_0$ = {float(rows[0]['t0']):,.0f} $t_c$,\n"
+        f"Drawn words ({counts}), N = {grains:,}, $t_0$ = {float(rows[0]['t0']):,.0f} $t_c$,\n"
         "mean ± SE over words; published: all words, N = 10,240",
         fontsize=10,
     )

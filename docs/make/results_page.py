@@ -169,7 +169,7 @@ def redraw() -> None:
     for path in sorted(HERE.glob("*/*-*.csv")):
         if path.stem.startswith("fig"):
             anew(path)
-    drawn_words.draw(drawn_words.read_rows(HERE / "drawn_words.csv"), HERE / "drawn_words.png")
+    drawn_words.draw(drawn_words.read_rows(HERE / "drawn_words.csv"), HERE / "drawn_words.png", 10_240)
     design_words.draw(HERE / "designed_words.csv", HERE / "designed_words.png")
 
 
