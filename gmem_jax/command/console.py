@@ -57,8 +57,9 @@ class _Out(Console):
 
 if not os.environ.get("COLUMNS", "1").strip("0"):  # unknown width; at 0 columns rich would print nothing
     del os.environ["COLUMNS"]
-stderr = _Log(stderr=True, highlight=False, markup=False)  # markup would let names in files style or break a line
-out = _Out(highlight=False, markup=False)
+# Markup would let names in files style or break a line; of "words:x: ..." rich would make "words" and an emoji.
+stderr = _Log(stderr=True, highlight=False, markup=False, emoji=False)
+out = _Out(highlight=False, markup=False, emoji=False)
 
 LONGEST_DURATION = 3e9  # seconds, a century: longer runs are a mistake
 LOG_INTERVAL = 30.0  # seconds between lines of progress where there is no terminal

@@ -280,6 +280,7 @@ BAD = [
         ["recall", "{pack}", "--signals", "words:13", "-o", "{out}"],
         "--signals words:13: words need a length from 1 to 12",
     ),
+    (["recall", "{pack}", "--signals", "words:x", "-o", "{out}"], "--signals words:x: words need a length"),  # no emoji
     (["recall", "{pack}", "--signals", "words", "-o", "{out}"], "words need a length from 1 to 12, as in words:3"),
     (["design", "{pack}", "--by", "kernel", "--start", "six"], "--start six: is no file of waveforms"),
     (["tune", "{pack},", "-o", "{json}"], "no pack is named beside a comma"),
