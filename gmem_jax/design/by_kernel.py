@@ -75,7 +75,9 @@ def refuse_another_drive(kernel: MemoryKernel, experiment: Experiment) -> None:
     written = amplitude_on(experiment, experiment.readings.channels[0])
     for name, own in (("gamma0", written), ("delta0", experiment.compression)):
         if getattr(kernel, name) != float(own):
-            raise ValueError(f"the kernel is of {name} = {getattr(kernel, name):g}, the experiment's is {float(own):g}")
+            raise ValueError(
+                f"the kernel was measured at {name} = {getattr(kernel, name):g}, but the experiment has {float(own):g}"
+            )
 
 
 @usual_rules()
@@ -127,7 +129,9 @@ def design_by_kernel(
     tell = callback(progress)
     refuse_several_scales(experiment)
     if len(written_sets(experiment)) > 1:
-        raise ValueError("a design by one kernel is of one channel; gm.design_waveforms designs several together")
+        raise ValueError(
+            "a design by a kernel needs an experiment with one channel; gm.design_waveforms designs several together"
+        )
     count = experiment.waveforms.count
     iterations, n = require_whole("iterations", iterations), require_whole("n", n, 1)
     measured = require_whole("measured", measured)

@@ -261,7 +261,7 @@ class Checkpoints(ResultCache):
     def discard(self) -> None:
         """Remove the folder; if it holds other files too, remove only ours."""
         if left := self._own.clear():
-            warn_caller(f"{self.folder}: left there, since it holds {left[0]}, which is not ours")
+            warn_caller(f"{self.folder}: not removed, since it holds {left[0]}, which was not written by the run")
 
 
 def _difference(one: Any, other: Any, name: str = "") -> tuple[str, Any, Any]:

@@ -44,8 +44,10 @@ def read_frames(content: Content) -> Frames | None:
     declared = _declared({name: content.datasets.get(f"{GROUP}/{name}") for name in _SOME})
     found = content.arrays({f"{GROUP}/{name}": array for name, array in declared.items()})
     stages, signal = json.loads(content.text("stages", GROUP)), content.attributes[GROUP].get("signal")
-    require(isinstance(stages, list), "the stages of its frames are no names")
-    require(isinstance(signal, np.integer) and whole(int(signal)), "the signal of its frames is no number")
+    require(isinstance(stages, list), "the stages of its frames must be a list of names")
+    require(
+        isinstance(signal, np.integer) and whole(int(signal)), "the signal of its frames must be a whole number from 0"
+    )
     own = {name: found[f"{GROUP}/{name}"] for name in declared}
     periodic = stored_axes(content, GROUP)
     frames = Frames(**own, stages=tuple(stages), signal=int(signal), periodic=periodic)  # type: ignore[arg-type]
@@ -60,23 +62,30 @@ def check_frames(frames: Frames) -> None:
         FileFormatError: saying what is wrong.
     """
     fit(_declared(vars(frames)), vars(frames))
-    require(all(map(title, frames.stages)), "the stages of its frames are no names")
+    require(all(map(title, frames.stages)), "the stages of its frames must be a list of names")
     require_finite({f"frames/{name}": getattr(frames, name) for name in FRAMES})
     start, spheres, rubbed = frames.start, frames.spheres, frames.wall_friction
     count, per_grain = frames.position.shape[1] * len(frames.offsets), len(frames.offsets)
     require_sizes(frames.radii, frames.sizes)
     if rubbed is not None:
         require_finite({"frames/wall_friction": rubbed})
-        require(rubbed.shape[1] == count, "the friction of its walls is not of all spheres")
-    require(len(frames.time) == frames.count > 0, "its frames must have one stage each, and there must be a frame")
+        require(
+            rubbed.shape[1] == count, f"the wall friction of its frames must have a row for each of its {count} spheres"
+        )
+    require(
+        len(frames.time) == frames.count > 0,
+        "its frames must have one time and one stage each, and there must be a frame",
+    )
     require(count > 0, "its frames hold no spheres")
     require(frames.lower < frames.upper, "a frame has a lower wall that is not below the upper one")
     require(np.abs(np.linalg.norm(frames.quaternion, axis=-1) - 1.0) < 1e-9, "a frame has a quaternion not of length 1")
     whole_list = len(start) == frames.count + 1 and start[0] == 0 and start[-1] == len(spheres)
-    require(whole_list and np.all(np.diff(start) >= 0), "the contacts of its frames are not one after the other")
+    require(
+        whole_list and np.all(np.diff(start) >= 0), "the contacts of its frames must follow each other, frame by frame"
+    )
     in_range = (spheres[:, 0] >= 0) & (spheres[:, 1] < count)
     apart = spheres[:, 0] // per_grain < spheres[:, 1] // per_grain
-    require(in_range & apart, "a contact of its frames is not between two of its grains")
+    require(in_range & apart, "a contact of its frames must be between spheres of two of its grains")
 
 
 def load_frames(path: Path) -> Frames | None:

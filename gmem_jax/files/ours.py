@@ -145,8 +145,8 @@ class Folder:
             others = sorted(entry.name for entry in path.iterdir() if not _TEMPORARY.fullmatch(entry.name))
             if others:
                 raise FileFormatError(
-                    f"{path}: holds {others[0]} and no {marker} of {schema}, so it is not ours and was left alone; "
-                    "move it away, or name another output"
+                    f"{path}: has no {marker} of {schema} but holds {others[0]}; "
+                    "its files may be someone else's, so nothing was changed; move it away, or name another output"
                 )
         return False
 
@@ -186,7 +186,7 @@ class Folder:
             FileFormatError: if the name is not one of ours, or a link is on the way.
         """
         if not self._names.fullmatch(name):
-            raise FileFormatError(f"{self.path}: {name!r} is no name of a file that belongs there; it was left alone")
+            raise FileFormatError(f"{self.path}: no file that is written there is named {name!r}; nothing was changed")
         path = self.path / name
         for step in (path, *path.parents):
             if step == self.path:

@@ -106,9 +106,11 @@ def _check_clump(found: Found, isotropic: bool) -> None:
 def _check_box(found: Found) -> None:
     lower, upper, delta0 = found["lower"], found["upper"], float(found["delta0"])
     require(len(found["position"]) > 0, "it holds no grains")
-    require(lower < upper, "a lower wall of the box is not below the upper one")
+    require(lower < upper, "a lower edge of the box is not below the upper one")
     require(interval(COMPRESSIONS).holds(delta0), f"delta0 must be in {COMPRESSIONS}, got {delta0:g}")
-    require(upper - lower < LARGEST_BOX, f"a box wider than {LARGEST_BOX:g} R is none of a pack at rest")
+    require(
+        upper - lower < LARGEST_BOX, f"an edge of the box is longer than {LARGEST_BOX:g} R: this is no pack at rest"
+    )
     filling = _filling(found)
     require(
         LOOSEST < filling < DENSEST,
@@ -140,20 +142,22 @@ def _check_list(found: Found, spheres: np.ndarray, radii: np.ndarray, periodic: 
     smallest, reach = found["pairs/smallest"], float(found["pairs/reach"])
     count, per_grain = len(spheres), len(found["clump/offsets"])
     lengths = found["upper"] - found["lower"]
-    require(len(reference) == count, f"its list is of {len(reference)} spheres, not {count}")
+    require(len(reference) == count, f"its list was made of {len(reference)} spheres, but it has {count}")
     widest, largest = 2.0 * float(radii.max()), float(found.get("clump/sizes", np.ones(1)).max())
     require(
         widest < reach < widest + 2.0,
         f"the reach of its list must be in ({widest:g}, {widest + 2.0:g}) R, got {reach:g}",
     )
-    require((smallest > 0.5 * lengths) & (smallest <= lengths * (1.0 + UNIT)), "its list is of another box")
+    require(
+        (smallest > 0.5 * lengths) & (smallest <= lengths * (1.0 + UNIT)), "its list was made in a box of another size"
+    )
     within = (reference > 0.0) & (reference < 1.0)
     require(within | np.asarray(periodic), "its list was made of spheres outside the box")
     try:
         require_room(smallest, periodic, reach, largest * float(found["clump/diameter"]))
     except ValueError as error:
         raise FileFormatError(str(error)) from error
-    require((listed >= 0) & (listed < count), f"a candidate is none of the {count} spheres")
+    require((listed >= 0) & (listed < count), f"a candidate names a sphere that is not among its {count}")
     require(
         listed[0] // per_grain < listed[1] // per_grain, "a candidate pairs a grain with itself, or is out of order"
     )

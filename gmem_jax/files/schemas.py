@@ -302,7 +302,7 @@ def other_kind(found: Any, *wanted: str) -> str:
         return f"it has no schema; {needed} is needed ({here})"
     if str(found).partition("/")[0] in (name.partition("/")[0] for name in wanted):
         return f"its schema is {str(found)[:40]!r}, of another version; this one reads {here}"
-    return f"its schema is {str(found)[:40]!r}, which is none of ours; {needed} is needed ({here})"
+    return f"its schema is {str(found)[:40]!r}, which is unknown here; {needed} is needed ({here})"
 
 
 def schema_page() -> str:

@@ -206,7 +206,7 @@ class _Preparation:
             checkpoint.save(standing)
             raise NotAtRestError(
                 f"{name}: p_z = {float(pressed.pressure[0]):.3e} E and largest speed "
-                f"{float(largest_speed(pressed.state)):.1e} R/t_c after {duration:g} t_c; with more patience it goes on"
+                f"{float(largest_speed(pressed.state)):.1e} R/t_c after {duration:g} t_c; more patience lets it go on"
             )
         return runner.snapshot(), pressed
 
@@ -271,7 +271,7 @@ class _Preparation:
             if waited > recipe.patience:
                 checkpoint.save(standing)
                 raise NotAtRestError(
-                    f"rest: largest speed {speed:.1e} R/t_c after {waited:g} t_c; with more patience it goes on"
+                    f"rest: largest speed {speed:.1e} R/t_c after {waited:g} t_c; more patience lets it go on"
                 )
             checkpoint.maybe_save(standing)
 

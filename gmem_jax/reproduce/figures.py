@@ -71,7 +71,9 @@ def scale_of(text: str, scales: Mapping[str, Scale] = SCALES) -> Scale:
     for change in changes:
         field, _, value = change.partition("=")
         if field not in known:
-            raise ValueError(f"{change!r} changes nothing of a scale; {', '.join(known)} could, as in {name},packs=1")
+            raise ValueError(
+                f"a scale has no field to set by {change!r}; it has {', '.join(known)}, as in {name},packs=1"
+            )
         was = getattr(found, field)
         wanted: Any
         try:

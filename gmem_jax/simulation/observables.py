@@ -64,7 +64,9 @@ class Observable:
     def __post_init__(self) -> None:
         for text in (self.name, self.unit, self.words):
             if not (isinstance(text, str) and text.isprintable() and len(text) <= LONGEST_LINE):
-                raise ValueError(f"name, unit and words are lines of up to {LONGEST_LINE} letters, got {text!r}")
+                raise ValueError(
+                    f"name, unit and words must each be one line of at most {LONGEST_LINE} letters, got {text!r}"
+                )
 
     def __call__(self, simulation: Simulation, state: State) -> jax.Array:
         """The values at the end of a bin, [..., B]."""

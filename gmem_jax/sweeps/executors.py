@@ -125,7 +125,7 @@ class Processes(Executor):
         own = cores()
         self.workers = workers or max(1, len(own) // CORES)
         if self.workers > len(own):
-            raise ValueError(f"{self.workers} workers need as many CPUs; {len(own)} can be used")
+            raise ValueError(f"{self.workers} workers need {self.workers} CPUs, but this process may use {len(own)}")
         ends = [len(own) * number // self.workers for number in range(self.workers + 1)]
         self._cores = [own[first:last] for first, last in itertools.pairwise(ends)]
         self._running: dict[str, subprocess.Popen[bytes]] = {}

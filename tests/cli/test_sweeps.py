@@ -180,7 +180,7 @@ def test_a_dry_run_makes_nothing_in_a_folder_that_is_there(
     assert not list(Path("empty").iterdir())
     Path("empty/notes.txt").write_text("mine")
     assert gmem(monkeypatch, "sweep", "mu.toml", "-o", "empty", "--dry-run") != 0
-    assert "holds notes.txt and no sweep.json" in capsys.readouterr().err
+    assert "but holds notes.txt; its files may be" in capsys.readouterr().err
 
 
 REFUSED = {
@@ -190,7 +190,7 @@ REFUSED = {
     "name the folder": ["sweep", "status"],
     "neither a sweep file": ["sweep", "recall.h5"],
     "no such figure": ["reproduce", "fig99"],
-    "changes nothing of a scale": ["reproduce", "fig06", "--scale", "paper,size=3"],
+    "a scale has no field to set by": ["reproduce", "fig06", "--scale", "paper,size=3"],
     "should read like timeout_min=240": ["reproduce", "fig06", "--option", "timeout_min"],
     "no option 'mem_gb'": ["reproduce", "fig06", "--option", "mem_gb=1.5"],
     "no option 'timeout_min'": ["reproduce", "fig06", "--dry-run", "--option", "timeout_min=240"],

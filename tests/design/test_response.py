@@ -195,7 +195,7 @@ def test_designs_of_what_is_read_twice_are_refused(experiment: gm.Experiment) ->
         ValueError, match="kernels need one read, and a set of waveforms for each channel; the protocol has 2 reads"
     ):
         gm.design_waveforms(again)
-    with pytest.raises(ValueError, match=r"of one channel; gm.design_waveforms designs several together"):
+    with pytest.raises(ValueError, match=r"with one channel; gm.design_waveforms designs several together"):
         gm.design_by_kernel(two_channels(experiment))
 
 
@@ -264,7 +264,7 @@ def test_a_kernel_that_is_there_is_not_measured_again(
     monkeypatch.delattr(by_kernel, "memory_kernel")
     given = gm.design_by_kernel(experiment, kernel=known, **asked)
     assert given.history == measured.history
-    with pytest.raises(ValueError, match=r"the kernel is of gamma0 = 0\.001, the experiment's is 0\.003"):
+    with pytest.raises(ValueError, match=r"the kernel was measured at gamma0 = 0\.001, but the experiment has 0\.003"):
         gm.design_by_kernel(gm.replace(experiment, gamma0=3e-3), kernel=known)
 
 

@@ -131,7 +131,7 @@ CHANGES = [
     (scale("ringing_period", 5e7), r"its ringing period is .* t_c, must be between 6.36 and 147 in a box of this size"),
     (scale("ringing_period", 0.1), "its ringing period is 1.96"),
     (squeeze, "its list misses spheres"),
-    (negative, "a candidate is none of the 108 spheres"),
+    (negative, "a candidate names a sphere that is not among its 108"),
     (one_less, "its list misses spheres"),
     (huge, "declares shape"),
     (many, "not stored in one piece"),
@@ -179,7 +179,7 @@ def test_a_file_of_another_kind_is_refused_with_what_it_is_and_what_is_needed(tm
             gm.load_pack(path)
     for name, words in (
         ("gmem-recall/0.1", "this is a recall; a pack is needed"),
-        ("x", "none of ours; a pack is needed"),
+        ("x", "unknown here; a pack is needed"),
     ):
         with writing(tmp_path / "kind.h5", name):
             pass

@@ -79,7 +79,7 @@ def test_a_user_s_folder_with_the_name_of_parts_is_left_alone(
     (tmp_path / "o.h5.parts" / "thesis.tex").write_text("all of it")
     before = tree(tmp_path)
     assert gmem(monkeypatch, "recall", PACK, "-o", tmp_path / "o.h5", "--t0", "75", *more) == 2
-    assert "holds deep and no run.json of gmem-parts/0.1, so it is not ours" in capsys.readouterr().err
+    assert "has no run.json of gmem-parts/0.1 but holds deep; its files may be" in capsys.readouterr().err
     assert tree(tmp_path) == before
 
 
@@ -100,7 +100,7 @@ def test_what_a_user_put_among_our_parts_outlives_them(tmp_path: Path) -> None:
     (tmp_path / "far.npz").write_text("elsewhere")
     (tmp_path / "parts" / "two.npz").symlink_to(tmp_path / "far.npz")
     assert parts.finished() == 1
-    with pytest.warns(UserWarning, match=r"holds notes\.txt, which is not ours"):
+    with pytest.warns(UserWarning, match=r"holds notes\.txt, which was not written"):
         parts.discard()
     assert sorted(tree(tmp_path)) == ["far.npz", "parts", "parts/notes.txt", "parts/run.json", "parts/two.npz"]
 
@@ -110,7 +110,7 @@ def test_a_folder_that_looks_like_a_sweep_is_not_taken_for_one(tmp_path: Path) -
         (tmp_path / "own" / name).mkdir(parents=True)
     (tmp_path / "own" / "jobs" / "letter.json").write_text("{}")
     before = tree(tmp_path)
-    with pytest.raises(gm.FileFormatError, match=r"holds jobs and no sweep\.json"):
+    with pytest.raises(gm.FileFormatError, match=r"has no sweep\.json of .* but holds jobs"):
         Store(tmp_path / "own")
     assert tree(tmp_path) == before
 
@@ -285,7 +285,7 @@ def test_a_folder_of_another_kind_is_not_ours(tmp_path: Path) -> None:
         Store(tmp_path / "parts")
     folder = Folder(tmp_path / "own", "mark.json", "own/1", re.compile(r"mark\.json|a\.txt"), {})
     for name in ("b.txt", "../a.txt", "/etc/passwd", "a.txt/../../x"):
-        with pytest.raises(gm.FileFormatError, match="no name of a file that belongs there"):
+        with pytest.raises(gm.FileFormatError, match="no file that is written there is named"):
             folder.remove(name)
 
 

@@ -136,7 +136,7 @@ def test_a_json_result_says_what_its_fields_are_and_what_is_none_is_refused(tmp_
         ({"fidelity": "high"}, "an impossible 'fidelity'"),
         (
             {"schema": "gmem-other/1"},
-            "its schema is 'gmem-other/1', which is none of ours; a gradient or a tuned drive or",
+            "its schema is 'gmem-other/1', which is unknown here; a gradient or a tuned drive or",
         ),
         ({"schema": None}, "it has no schema; .* is needed"),
         ({"schema": "gmem-pack/0.1"}, "this is a pack; a gradient or .* is needed"),

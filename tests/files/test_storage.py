@@ -70,8 +70,8 @@ def test_frames_and_stages_that_could_not_be_read_are_not_written(tmp_path: Path
     frames = frames_of_pack(pack)
     for wrong, reason in (
         (replace(frames, position=np.nan * frames.position), "not finite"),
-        (replace(frames, stages=("one", "two")), "must have one stage each"),
-        (replace(frames, stages=("two\nlines",)), "no names"),
+        (replace(frames, stages=("one", "two")), "must have one time and one stage each"),
+        (replace(frames, stages=("two\nlines",)), "a list of names"),
     ):
         with pytest.raises(gm.FileFormatError, match=reason):
             gm.save_pack(tmp_path / "a.h5", pack, frames=wrong)

@@ -94,7 +94,7 @@ def test_a_scale_with_changes() -> None:
     assert changed == replace(SCALES["paper"], t0=5400.0, packs=1, lengths=(3, 4))
     for text, wrong in {
         "poster": "no scale 'poster'; there are laptop, workstation, paper",
-        "laptop,t=5": "'t=5' changes nothing of a scale",
+        "laptop,t=5": "a scale has no field to set by 't=5'",
         "laptop,packs=1.5": "must be like packs=5",
         "laptop,lengths=3,4": "'4' changes nothing",
         "laptop,lengths=": r"must be like lengths=3\+4\+5",

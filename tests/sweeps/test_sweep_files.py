@@ -321,7 +321,7 @@ def test_a_key_stands_for_all_that_numbers_depend_on(tmp_path: Path) -> None:
 
 def test_a_folder_that_holds_something_else_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("all of it")
-    with pytest.raises(gm.FileFormatError, match=r"holds thesis\.tex and no sweep\.json"):
+    with pytest.raises(gm.FileFormatError, match=r"has no sweep\.json of .* but holds thesis\.tex"):
         Store(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
@@ -332,7 +332,7 @@ def test_executors_that_cannot_be_had_say_so(monkeypatch: pytest.MonkeyPatch) ->
         executor("slurm", 1, {})
     with pytest.raises(ValueError, match="must be processes, slurm or local"):
         executor("cloud", 1, {})
-    with pytest.raises(ValueError, match="as many CPUs"):
+    with pytest.raises(ValueError, match=r"workers need \d+ CPUs"):
         executor("processes", 10_000, {})
     with pytest.raises(ValueError, match="no option 'queue'"):
         executor("processes", 1, {"queue": "long"})
