@@ -179,7 +179,7 @@ class Motion:
 
 def strain_path(lower, upper, delta0, gamma0=0.0, signals=None, **share) -> StrainPath:
     """The walls of the paper: waveforms on channel xy, or none."""
-    lanes = {} if signals is None else {"waveforms": (signals,), "lanes": (Lane("xy", "xy"),), "fixed": (False,)}
+    lanes = {} if signals is None else {"waveforms": (signals,), "lanes": (Lane("xy", "xy"),)}
     return StrainPath(lower, upper, delta0, gamma0, **lanes, **share)
 
 

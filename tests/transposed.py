@@ -33,10 +33,10 @@ def assert_transposed(system: System, state: State, boxes: Box, dt: float = 0.3,
         J^T w, `calls.Arrays`.
     """
     boxes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*leaf.shape[:-1], state.replicas)), boxes)
-    numbers = jnp.asarray(dt), jnp.asarray(drag)
-    arrays = arrays_of(system, state.grains, state.history, boxes, numbers, state.cell, state.wall_history)
+    numbers, histories = (jnp.asarray(dt), jnp.asarray(drag)), (state.history, state.wall_history)
+    arrays = arrays_of(system, state.grains, histories, boxes, numbers, state.cell)
     call, fixed = call_of(system, boxes.periodic), fixed_of(system)
-    definition = PlainDefinition.of(system, state.history, True, boxes.periodic, state.wall_history)
+    definition = PlainDefinition.of(system, histories, True, boxes.periodic)
 
     def forwards(along: Any) -> Any:
         return primitives.tangent(call, definition, fixed, arrays, along)

@@ -21,11 +21,10 @@ from gmem_jax.physics.boundary import WALLS, PeriodicAxes
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
-from gmem_jax.physics.grain import Clump
+from gmem_jax.physics.grain import Clump, radii_of_spheres
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pytree import Scalar
 from gmem_jax.physics.rotation import matrix
-from gmem_jax.simulation.frames import radii_of_spheres
 
 OUTPUT = "id x y z vx vy vz omegax omegay omegaz fx fy fz"
 

@@ -16,10 +16,11 @@ from gmem_jax.files.checkpoints import locked
 from gmem_jax.physics.state import combined_status
 from gmem_jax.reproduce import choices
 from gmem_jax.reproduce.choices import Effect
-from gmem_jax.reproduce.cost import spec_of_all
+from gmem_jax.reproduce.compare import Compared
+from gmem_jax.reproduce.cost import spec_for_all
 from gmem_jax.reproduce.dataset import COLLECTED
-from gmem_jax.reproduce.figures import FIGURES, SCALES, scale_of
-from gmem_jax.reproduce.run import GALLERY, RUNS, SCHEMATICS, Outcome, Reproduction, Weighed, outcome_summary
+from gmem_jax.reproduce.figures import FIGURES, GALLERY, SCALES, scale_of
+from gmem_jax.reproduce.run import RUNS, SCHEMATICS, Outcome, Reproduction, outcome_summary
 from gmem_jax.show.tables import decimal
 from gmem_jax.simulation.progress import Progress
 from gmem_jax.sweeps.cost import cost_of
@@ -69,7 +70,8 @@ def reproduce_command(
     executor_named(executor, workers, options)  # refuses an impossible executor before anything is written
     check_folder(output)
     output.mkdir(exist_ok=True)
-    outcomes, verdicts, weighed, drawn = [], [], Weighed([], [], []), []
+    outcomes, verdicts, drawn = [], [], []
+    weighed: Outcome[Effect] = Outcome("choices", [], [], [])
     archives: list[Path] = []
     broken: list[str] = []
     statuses: list[int] = []
@@ -108,13 +110,13 @@ def reproduce_command(
     result = {
         "figures": [outcome_summary(outcome) for outcome in outcomes],
         "claims": [verdict._asdict() for verdict in verdicts],
-        "choices": choices.effect_rows(weighed.effects),
+        "choices": choices.effect_rows(weighed.rows),
         "pictures": [str(path) for path in drawn],
         "dataset": [str(path) for path in archives],
         "status": combined_status(statuses),
     }
     lines = [f"{'yes' if verdict.holds else 'NO ':4}{verdict.claim}\n    {verdict.numbers}" for verdict in verdicts]
-    more = [_choices_table(weighed.effects)] if weighed.effects else []
+    more = [_choices_table(weighed.rows)] if weighed.rows else []
     print_result(as_json, result, *lines, *more, *map(_table, outcomes))
     broken += weighed.failed + [reason for outcome in outcomes for reason in outcome.failed]
     if broken:
@@ -127,7 +129,7 @@ def _say_cost(what: str, scale: str, output: Path, workers: int, as_json: bool) 
     names = list(COLLECTED) if what == "dataset" else names
     facts, lines = {}, ["seconds: no experiment is run"]
     if names:
-        cost = cost_of(spec_of_all(names, scale), output / RUNS, workers=workers, only_packs=names == [GALLERY])
+        cost = cost_of(spec_for_all(names, scale), output / RUNS, workers=workers, only_packs=names == [GALLERY])
         facts, lines = cost._asdict(), cost.lines
     training = size.nets * len(size.lengths) * size.budget if "fig14" in names else 0.0
     lines += [f"nets: trained for {training / 60.0:.0f} min at most"] if training else []
@@ -164,7 +166,7 @@ def _options(texts: Sequence[str]) -> dict[str, Any]:
     return options
 
 
-def _say_written(done: Outcome | Weighed) -> None:
+def _say_written(done: Outcome[Any]) -> None:
     for reason in sorted(set(done.failed)):
         log(f"failed: {reason}", style="yellow")
     if done.files:
@@ -184,7 +186,7 @@ def _choices_table(effects: Sequence[Effect]) -> Table:
     return table
 
 
-def _table(outcome: Outcome) -> Table:
+def _table(outcome: Outcome[Compared]) -> Table:
     """A table of our measures beside the published ones, with the conditions that vary."""
     table = Table(title=outcome.name, caption="mean ± SE; difference in combined standard errors, for the same N")
     fields = [name for name in (outcome.rows[0].conditions.__dict__ if outcome.rows else ())]

@@ -20,6 +20,7 @@ from gmem_jax.derivatives.moving import (
     Moving,
     fixed_by,
     moving_of,
+    numbers_by,
     numbers_of,
     require_derivatives,
     state_of,
@@ -249,10 +250,7 @@ def value_and_grad(
     rest.reads = {name: np.asarray(by) for name, by in by_pressures.items()}
 
     def pull_numbers(sheared: bool, found: Any) -> Any:
-        def numbers(theta: Any) -> list[jax.Array]:
-            return numbers_of(along(theta).simulation(sheared=sheared), fixed)
-
-        return jax.vjp(numbers, theta)[1](found)[0]
+        return jax.vjp(numbers_by(experiment, fixed, sheared=sheared), theta)[1](found)[0]
 
     back = jax.tree.map(jnp.zeros_like, moving_of(on.state))
     way = _Backwards(within(tell, FORWARDS, 1.0), (rest, prefix), checkpoint)

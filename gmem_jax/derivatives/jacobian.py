@@ -72,8 +72,10 @@ def _one_signal(experiment: Experiment) -> tuple[Bumps, np.ndarray]:
     return bumps, np.asarray(bumps.amplitudes)
 
 
-def _law_values(experiment: Experiment) -> list[float]:
-    return [float(value_at(experiment, path)) for path in LAW.values()]
+def _parameters(experiment: Experiment, row: np.ndarray) -> dict[str, float]:
+    """The parameters by name, in the order of the derivatives; `row` has the amplitudes, [1, n]."""
+    laws = {name: float(value_at(experiment, path)) for name, path in LAW.items()}
+    return {**{f"amplitude {k + 1}": a for k, a in enumerate(row[0])}, "gamma0": float(experiment.gamma0), **laws}
 
 
 def _stress(experiment: Experiment, pressure: dict[str, np.ndarray]) -> np.ndarray:
@@ -129,8 +131,6 @@ def exact(experiment: Experiment, *, progress: ProgressChoice = None) -> Jacobia
         "gamma0": jnp.zeros(n + 2).at[-1].set(1.0),
     }
     pushed = push(drive, direction, progress=within(tell, 0.0, SHARE))
-    names = [*(f"amplitude {k + 1}" for k in range(n)), "gamma0"]
-    values = [*row[0], float(experiment.gamma0)]
     p_sig, stress = [np.asarray(pushed.p_sig_slope)], [_stress(experiment, pushed.slope)[1:]]
     two = jnp.asarray(np.concatenate([np.zeros_like(row), row, row]))  # 0, 1: no signal; 2, 3: the signal
     wide = {path: jnp.full(4, value_at(experiment, path)) for path in LAW.values()}
@@ -142,9 +142,8 @@ def exact(experiment: Experiment, *, progress: ProgressChoice = None) -> Jacobia
     pushed = push(laws, direction, progress=within(tell, SHARE, 1.0))
     p_sig.append(_recalled(experiment, pushed.slope))
     stress.append(_stress(experiment, pushed.slope)[2:])
-    names += LAW
-    values += _law_values(experiment)
-    return Jacobian(tuple(names), np.asarray(values), np.concatenate(p_sig), np.concatenate(stress))
+    known = _parameters(experiment, row)
+    return Jacobian(tuple(known), np.asarray([*known.values()]), np.concatenate(p_sig), np.concatenate(stress))
 
 
 def differences(experiment: Experiment, relative: float) -> Jacobian:
@@ -167,25 +166,20 @@ def differences(experiment: Experiment, relative: float) -> Jacobian:
     widths[n] *= float(experiment.gamma0)
     up, down = [*range(n), 2 * n], [*range(n, 2 * n), 2 * n + 1]
     slopes = [(recalled[up] - recalled[down]) / widths], [(stress[up] - stress[down]) / widths]
-    names = [*(f"amplitude {k + 1}" for k in range(n)), "gamma0"]
-    values = [*row[0], float(experiment.gamma0)]
-    law_values = _law_values(experiment)
+    known = _parameters(experiment, row)
     factor = {"mu": [1.0, -1.0, 0.0, 0.0], "stiffness": [0.0, 0.0, 1.0, -1.0]}
     shifted = {
-        path: jnp.asarray(value * (1.0 + relative * np.tile(factor[name], 2)))
-        for (name, path), value in zip(LAW.items(), law_values, strict=True)
+        path: jnp.asarray(known[name] * (1.0 + relative * np.tile(factor[name], 2))) for name, path in LAW.items()
     }
     rows = jnp.asarray(np.concatenate([np.zeros((3, n)), np.repeat(row, 4, axis=0)]))
     other = replace(experiment, {**shifted, "signals": _copies(bumps, rows)})
     pressure = _pressures(run(other, progress=False))
     signal = _recalled(experiment, pressure)
     stress = _stress(experiment, pressure)[4:]
-    widths = 2.0 * relative * np.asarray(law_values)[:, None]
+    widths = 2.0 * relative * np.asarray([known[name] for name in LAW])[:, None]
     slopes[0].append((signal[[0, 2]] - signal[[1, 3]]) / widths)
     slopes[1].append((stress[[0, 2]] - stress[[1, 3]]) / widths)
-    names += LAW
-    values += law_values
-    return Jacobian(tuple(names), np.asarray(values), np.concatenate(slopes[0]), np.concatenate(slopes[1]))
+    return Jacobian(tuple(known), np.asarray([*known.values()]), np.concatenate(slopes[0]), np.concatenate(slopes[1]))
 
 
 def mismatch(one: Jacobian, other: Jacobian) -> dict[str, float]:

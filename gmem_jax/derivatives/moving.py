@@ -1,6 +1,6 @@
 """The numbers of an experiment and of a running state with respect to which a run can be differentiated."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields
 from typing import Any
 
@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment.arguments import require_several
+from gmem_jax.experiment.changes import replace as with_values
 from gmem_jax.experiment.changes import value_at
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.physics.state import State
@@ -42,6 +43,11 @@ def numbers_of(simulation: Simulation, fixed: tuple[str, ...]) -> list[jax.Array
     """The numbers of a simulation with respect to which derivatives are taken."""
     leaves = jax.tree_util.tree_leaves_with_path(simulation)
     return [jnp.asarray(leaf) for path, leaf in leaves if _is_moving(path, leaf, fixed)]
+
+
+def numbers_by(experiment: Experiment, fixed: tuple[str, ...], *, sheared: bool) -> Callable[[Any], list[jax.Array]]:
+    """The numbers of the experiment's simulation as a function of its parts by dotted name."""
+    return lambda theta: numbers_of(with_values(experiment, theta).simulation(sheared=sheared), fixed)
 
 
 def with_numbers(simulation: Simulation, numbers: Sequence[jax.Array], fixed: tuple[str, ...]) -> Simulation:

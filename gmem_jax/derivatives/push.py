@@ -12,6 +12,7 @@ from gmem_jax.derivatives.moving import (
     Moving,
     fixed_by,
     moving_of,
+    numbers_by,
     numbers_of,
     require_derivatives,
     state_of,
@@ -134,24 +135,21 @@ def push(experiment: Experiment, direction: Mapping[str, Any], *, progress: Prog
     if any(map(acts_on_prefix, theta)):
         slope = jax.jvp(lambda theta: moving_of(with_values(experiment, theta).begin()), (theta,), (tangent,))[1]
     fixed = fixed_by(theta)
-    pushing = _Pushing(fixed, _number_slope(experiment, theta, tangent, fixed, sheared=False), slope)
+
+    def number_slope(sheared: bool) -> Any:
+        return jax.jvp(numbers_by(experiment, fixed, sheared=sheared), (theta,), (tangent,))[1]
+
+    pushing = _Pushing(fixed, number_slope(False), slope)
     on.observers = (pushing,)
     samples = on.run_stages(*common)
     if pushing.moving is None:
         pushing.moving = jax.tree.map(jnp.zeros_like, moving_of(on.state))
     if not wide:
         pushing.moving = jax.tree.map(lambda leaf: jnp.repeat(leaf, experiment.replicas, axis=-1), pushing.moving)
-    pushing.numbers = _number_slope(experiment, theta, tangent, fixed, sheared=True)
+    pushing.numbers = number_slope(True)
     apply_waveforms(on, experiment)
     samples |= on.run_stages(*own)
     pressure = {name: np.asarray(sample.pressure) for name, sample in samples.items()}
     slopes = {name: np.concatenate(parts) for name, parts in pushing.slopes.items()}
     read, change = ({name: jnp.asarray(of[name]) for name in experiment.protocol.reads} for of in (pressure, slopes))
     return Pushed(pressure, slopes, experiment.recalled(read), experiment.recalled(change))
-
-
-def _number_slope(experiment: Experiment, theta: Any, tangent: Any, fixed: tuple[str, ...], *, sheared: bool) -> Any:
-    def numbers(theta: Any) -> list[jax.Array]:
-        return numbers_of(with_values(experiment, theta).simulation(sheared=sheared), fixed)
-
-    return jax.jvp(numbers, (theta,), (tangent,))[1]

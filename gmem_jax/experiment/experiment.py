@@ -29,7 +29,7 @@ from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.protocols import Shear, memory_protocol
 from gmem_jax.experiment.readings import Readings
 from gmem_jax.experiment.signals import Signals, SignalSets, bin_average, sets_of, waveform
-from gmem_jax.native.backend import BACKENDS, Backend, Precision, backend_name, require_precision, supports
+from gmem_jax.native.backend import Backend, Precision, backend_name, require_precision, supports
 from gmem_jax.physics.contact.friction import CoulombLaw, FrictionLaw
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
@@ -46,7 +46,7 @@ from gmem_jax.simulation.channels import CHANNELS
 from gmem_jax.simulation.loop import Observe, Simulation, at_rest
 from gmem_jax.simulation.protocol import Protocol
 from gmem_jax.simulation.stable_step import LONGEST_STEP
-from gmem_jax.simulation.stage import BINS, Columns, Drive, Lane, Stage, bin_centres
+from gmem_jax.simulation.stage import BINS, Columns, Lane, Stage, bin_centres
 from gmem_jax.simulation.strain import COMPRESSIONS, Sine, StrainPath, Waveforms
 
 PAPER_T0 = 1.8e4  # the paper's duration of a compression, in t_c
@@ -182,8 +182,6 @@ class Experiment:
         if self.shear not in get_args(Shear):
             raise ValueError(f"shear must be {' or '.join(get_args(Shear))}, got {self.shear!r}")
         self._set_protocol()
-        if self.backend not in BACKENDS:
-            raise ValueError(f"backend must be one of {', '.join(BACKENDS)}; got {self.backend!r}")
         of_pack = self.pack.periodic, self.pack.clump.equal, self.wall_mu is None
         require_precision(self.precision, self.backend, self.friction, *of_pack)
         require_walls(self.pack.periodic, self.material, self.wall_mu)
@@ -371,14 +369,13 @@ class Experiment:
         columns: Columns = self.protocol.columns
         if sheared:
             waveforms = tuple(map(self._waveforms, columns.lanes))
-            fixed = tuple(Drive(*lane).fixed for lane in columns.lanes)
-            drive = (self.gamma0, waveforms, self.shear_share, columns.lanes, fixed)
+            drive = (self.gamma0, waveforms, self.shear_share, columns.lanes)
         else:
-            columns, drive = columns._replace(lanes=()), (0.0, (), 1.0, (), ())
+            columns, drive = columns._replace(lanes=()), (0.0, (), 1.0, ())
         dt, steps = self.timing
         return Simulation(
             System(self.pack.clump, self.friction, self.pack.pairs, self.material, self.gravity, self.wall_mu),
-            StrainPath(lower, upper, self.compression, *drive, self.pack.periodic),
+            StrainPath(lower, upper, self.compression, *drive, periodic=self.pack.periodic),
             dt,
             self.drag,
             steps=steps,
@@ -391,7 +388,7 @@ class Experiment:
         )
 
     def _waveforms(self, lane: Lane) -> Waveforms:
-        drive = Drive(*lane)
+        drive = lane.drive
         if not drive.fixed:
             return self.sets[str(lane.waveform)]
         if drive.periods:

@@ -42,15 +42,14 @@ def signals_to_dict(signals: Signals | SignalSets) -> dict[str, Any]:
     """Waveforms as JSON: by the call that made them if their numbers are unchanged since, else by their numbers."""
     if isinstance(signals, SignalSets):
         return {"kind": "sets", **{name: signals_to_dict(one) for name, one in sets_of(signals).items()}}
-    if isinstance(signals, Bumps) and signals.form:
+    if type(signals) is Bumps and signals.form:  # a class of the user's own may give other waveforms
         form: dict[str, Any] = json.loads(signals.form)
         named = NAMED[form["kind"]](**{name: value for name, value in form.items() if name != "kind"})
         if fingerprint(signals) == fingerprint(named):
             return form
-    for kind, known in SIGNALS.items():
-        if isinstance(signals, known):
-            numbers = (entry.name for entry in fields(known) if entry.init)
-            return {"kind": kind, **{name: plain(getattr(signals, name)) for name in numbers}}
+    if kind := next((kind for kind, known in SIGNALS.items() if known is type(signals)), None):
+        numbers = (entry.name for entry in fields(SIGNALS[kind]) if entry.init)
+        return {"kind": kind, **{name: plain(getattr(signals, name)) for name in numbers}}
     return {"kind": type(signals).__name__, "sha256": fingerprint(signals)}
 
 

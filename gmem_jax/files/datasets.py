@@ -14,7 +14,7 @@ from gmem_jax.files.hdf5 import OBSERVED, observed_array
 from gmem_jax.files.measures import of_each
 from gmem_jax.files.schemas import RECALL, STAGE, declared_of_recall
 from gmem_jax.files.validation import optional
-from gmem_jax.simulation.stage import BINS
+from gmem_jax.simulation.sample import ends_of_bins
 
 
 def to_xarray(recall: Recall) -> Any:
@@ -34,7 +34,7 @@ def to_xarray(recall: Recall) -> Any:
     stages, replicas = recall.stages, len(recall.status)
     bins = {name: len(sample.filling) for name, sample in stages.items()}
     joined: dict[str, Any] = {
-        "time": np.arange(1, sum(bins.values()) + 1) / BINS,
+        "time": np.concatenate([*ends_of_bins(stages, recall.protocol.begins).values()]),
         "u_of_time": np.concatenate([np.asarray(sample.u)[:, 0] for sample in stages.values()]),
         "stage": np.repeat(list(bins), list(bins.values())),
     }

@@ -16,9 +16,10 @@ from gmem_jax.files.atomic import atomic
 from gmem_jax.files.loads import frame_wall_forces, pressure_tensor
 from gmem_jax.files.ours import place
 from gmem_jax.files.validation import optional
+from gmem_jax.physics.grain import radii_of_spheres
 from gmem_jax.physics.material import Material
-from gmem_jax.physics.pairs import listed_candidates
-from gmem_jax.simulation.frames import Frames, images_met, radii_of_spheres, sphere_places
+from gmem_jax.physics.pairs import listed_candidates, sphere_places
+from gmem_jax.simulation.frames import Frames, images_met
 
 
 def frames_of_pack(pack: Pack, material: Material = Material()) -> Frames:

@@ -21,8 +21,7 @@ from gmem_jax.files.seal import BLOCK, HDF5, require_sealed, seal
 from gmem_jax.files.tree import Tree
 from gmem_jax.files.validation import Array, fit, refusing
 from gmem_jax.physics.boundary import WALLS, PeriodicAxes, periodic_axes
-from gmem_jax.simulation.sample import MEASURED, Sample
-from gmem_jax.simulation.stage import BINS
+from gmem_jax.simulation.sample import MEASURED, Sample, ends_of_bins
 
 OBSERVED = "observed_"  # prefix of the arrays of observers
 
@@ -191,23 +190,25 @@ def _scale(group: h5py.Group, name: str, length: int) -> h5py.Dataset:
 
 
 def write_samples(
-    group: h5py.Group, stages: Mapping[str, Sample], observed: Mapping[str, Mapping[str, str]] | None = None
+    group: h5py.Group,
+    stages: Mapping[str, Sample],
+    begins: Mapping[str, int] | None = None,
+    observed: Mapping[str, Mapping[str, str]] | None = None,
 ) -> None:
     """Write a group for every stage, in order, with a dataset for each quantity.
 
     Args:
         group: the group that gets these groups.
         stages: samples by stage.
+        begins: see `ends_of_bins`.
         observed: unit and description of the arrays of observers, by name.
     """
-    passed = 0
+    times = ends_of_bins(stages, begins)
     for number, (name, sample) in enumerate(stages.items()):
         stage = group.create_group(name)
         stage.attrs["order"] = number
-        bins, wide = np.shape(sample.filling)
-        ends = np.arange(1, bins + 1)
-        values = {**vars(sample), "time": (passed + ends) / BINS, "u": np.asarray(sample.u)[:, 0]}
-        passed += bins
+        wide = np.shape(sample.filling)[1]
+        values = {**vars(sample), "time": times[name], "u": np.asarray(sample.u)[:, 0]}
         declared = dict(STAGE)
         for name, seen in (sample.observed or {}).items():
             known = (observed or {}).get(name, {})

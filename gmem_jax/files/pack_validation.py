@@ -20,9 +20,9 @@ from gmem_jax.files.validation import (
     whole,
 )
 from gmem_jax.physics.boundary import WALLS, PeriodicAxes, require_room
-from gmem_jax.physics.pairs import nearest_images
+from gmem_jax.physics.grain import radii_of_spheres
+from gmem_jax.physics.pairs import nearest_images, sphere_places
 from gmem_jax.physics.pytree import interval
-from gmem_jax.simulation.frames import radii_of_spheres, sphere_places
 from gmem_jax.simulation.strain import COMPRESSIONS
 
 UNIT = 1e-9  # tolerance of a quaternion's length and of numbers that are computed again; round-off is below 1e-14

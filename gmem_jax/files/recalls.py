@@ -63,7 +63,7 @@ def save_recall(path: str | Path, recall: Recall) -> None:
         file.attrs["reads"], file.attrs["channels"] = json.dumps(recall.reads), json.dumps(recall.channels)
         values = {**vars(recall), **of_each(recall), "signal": names}
         write_arrays(file, _declared(recall.reads, recall.channels, np.ndim(recall.dt)), values)
-        write_samples(file.create_group("stages"), recall.stages, configuration.get("observed"))
+        write_samples(file.create_group("stages"), recall.stages, recall.protocol.begins, configuration.get("observed"))
         if recall.frames is not None:
             write_frames(file, recall.frames)
 

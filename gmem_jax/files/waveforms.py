@@ -227,10 +227,12 @@ def named_signals(
         FileNotFoundError: if there is no such file.
         FileFormatError: if a file cannot be read.
     """
-    shape = (pad, width, smooth, taper, scale)
+    of_words = {key: float(value) for key, value in (("pad", pad), ("width", width)) if value is not None}
+    asked: dict[str, Any] = {"smooth": smooth, "taper": taper, "scale": scale}
+    of_samples = {key: value for key, value in asked.items() if value is not None}
     if named := sets_named(name):
-        return signals(**{one: _one_set(what, *shape, told=told) for one, what in named})
-    return _one_set(str(name), *shape, told=told)
+        return signals(**{one: _one_set(what, of_words, of_samples, told) for one, what in named})
+    return _one_set(str(name), of_words, of_samples, told)
 
 
 def sets_named(name: str | Sets) -> Sets:
@@ -249,33 +251,21 @@ def sets_named(name: str | Sets) -> Sets:
     return found
 
 
-def _one_set(
-    name: str,
-    pad: float | None,
-    width: float | None,
-    smooth: float | None,
-    taper: float | None,
-    scale: bool | None,
-    *,
-    told: Told,
-) -> Signals:
+def _one_set(name: str, of_words: dict[str, float], of_samples: dict[str, Any], told: Told) -> Signals:
     kind, _, length = name.lower().partition(":")
-    shape = {name: float(value) for name, value in (("pad", pad), ("width", width)) if value is not None}
-    done: dict[str, Any] = {"smooth": smooth, "taper": taper, "scale": scale}
-    done = {name: value for name, value in done.items() if value is not None}
-    if shape and kind != "words":
+    if of_words and kind != "words":
         raise ValueError(f"--signals {name}: word_pad and word_width are for words:L only")
-    if done and kind in ("six", "words"):
-        raise ValueError(f"--signals {name}: {', '.join(done)}: for samples in a file only")
+    if of_samples and kind in ("six", "words"):
+        raise ValueError(f"--signals {name}: {', '.join(of_samples)}: for samples in a file only")
     if kind == "six":
         return six_signals()
     if kind == "words":
         if not length.isdecimal() or not 1 <= int(length) <= LONGEST_WORD:
             raise ValueError(f"--signals {name}: words need a length from 1 to {LONGEST_WORD}, as in words:3")
-        return words(int(length), **shape)
+        return words(int(length), **of_words)
     if Path(name).suffix.lower() not in (".csv", ".npy"):
         raise ValueError(f'--signals {name}: must be "six", "words:L" or a .csv or .npy file')
-    made = waveform(load_waveforms(Path(name), told=told, **done))
+    made = waveform(load_waveforms(Path(name), told=told, **of_samples))
     if Path(name).suffix.lower() == ".csv" and load_target(Path(name)) is not None:
         told(f"{name}: holds designed waveforms and their target; only gmem recall compares with the target, too")
     return made

@@ -25,20 +25,9 @@ import gmem_start
 # In a process of the command, modules import only what they need, as in `gmem_jax`.
 if TYPE_CHECKING or not gmem_start.alone:
     from gmem_jax.native import library
-    from gmem_jax.native.backend import (
-        BACKENDS,
-        PRECISIONS,
-        Backend,
-        Precision,
-        ResolvedBackend,
-        backend_name,
-        marcher,
-        require_precision,
-        resolve,
-        supports,
-    )
+    from gmem_jax.native.backend import backend_name, marcher, resolve
     from gmem_jax.native.calls import TARGETS
-    from gmem_jax.native.library import available, cpus, needs, require_threads
+    from gmem_jax.native.library import available, needs
     from gmem_jax.native.march import March, march
     from gmem_jax.native.search import search
 
@@ -49,22 +38,13 @@ if TYPE_CHECKING or not gmem_start.alone:
         library.load_library()
 
 __all__ = [
-    "BACKENDS",
-    "PRECISIONS",
     "TARGETS",
-    "Backend",
     "March",
-    "Precision",
-    "ResolvedBackend",
     "available",
     "backend_name",
-    "cpus",
     "march",
     "marcher",
     "needs",
-    "require_precision",
-    "require_threads",
     "resolve",
     "search",
-    "supports",
 ]

@@ -10,7 +10,7 @@ from gmem_jax.native import cuda, library
 from gmem_jax.native.census import census_anywhere, census_by_library
 from gmem_jax.native.march import March, march, march_anywhere, march_mixed, require_mixed
 from gmem_jax.physics import step as dynamics
-from gmem_jax.physics.boundary import WALLS, PeriodicAxes
+from gmem_jax.physics.boundary import PeriodicAxes
 from gmem_jax.physics.census import TakeCensus, take_census
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.laws import entry_of
@@ -103,14 +103,9 @@ def _require_known(backend: str) -> None:
 
 
 def require_precision(
-    precision: str,
-    backend: str,
-    law: FrictionLaw,
-    periodic: PeriodicAxes = WALLS,
-    equal: bool = True,
-    smooth: bool = True,
+    precision: str, backend: str, law: FrictionLaw, periodic: PeriodicAxes, equal: bool, smooth: bool
 ) -> None:
-    """Refuse a precision that is unknown or not available.
+    """Refuse a backend or a precision that is unknown, or a precision that is not available.
 
     Args:
         precision: as in `marcher`.
@@ -123,6 +118,7 @@ def require_precision(
     Raises:
         ValueError: saying why.
     """
+    _require_known(backend)
     if precision not in PRECISIONS:
         raise ValueError(f"precision must be one of {', '.join(PRECISIONS)}; got {precision!r}")
     if precision == "double":

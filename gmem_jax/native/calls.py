@@ -8,6 +8,7 @@ sharded by replicas runs on each device by itself.
 import functools
 import itertools
 import math
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol
 
@@ -190,12 +191,8 @@ def call_library(
     pack = {**fixed._asdict(), "offsets": arrays.offsets[..., 0]}
     del pack["incidence"]
     before = [*arrays.fields, *pack.values(), arrays.parameters, arrays.walls]
-    shapes, aliases = outputs(parts), {}
-    if in_place:  # histories, by far the largest arrays, are updated in their own memory
-        for number, leaf in enumerate(arrays.history):
-            argument, result = len(before) + number, len(arrays.fields) + 1 + number
-            if leaf.shape == shapes[result].shape:
-                aliases[argument] = result
+    shapes = outputs(parts)
+    aliases = cuda.aliases_of(before, arrays, shapes) if in_place else {}
     run = jax.ffi.ffi_call(target, shapes, input_output_aliases=aliases)
     found: Sequence[jax.Array] = run(*before, *arrays.history, *jax.tree.leaves(slopes), **call._asdict())
     return found
@@ -222,7 +219,7 @@ def over(function: Callable[..., Any], leading: tuple[int, ...]) -> Callable[...
 def make_primitive(
     target: str,
     outputs: Callable[[Any], list[Any]],
-    plain: Callable[..., Any],
+    plain: Callable[..., Any] = operator.call,
     in_place: bool = False,
     make: Callable[..., Sequence[jax.Array]] = call_library,
 ) -> Primitive:
@@ -231,7 +228,7 @@ def make_primitive(
     Args:
         target: name of the call in XLA.
         outputs: function from the arguments to the shapes of the results.
-        plain: the call in plain JAX, a function of the definition and the arguments.
+        plain: the call in plain JAX, a function of the definition and the arguments; default the definition itself.
         in_place: whether histories are updated in their own memory.
         make: makes the call of the library, with the arguments of `call_library`.
     """

@@ -138,10 +138,6 @@ class PlainCensus:
         return jnp.stack(take_census(replace(empty, clump=clump, pairs=pairs), state, box))
 
 
-def _plain(definition: PlainCensus, listed: Listed, seen: Seen) -> list[jax.Array]:
-    return [definition(listed, seen)]
-
-
 def _rows(parts: tuple[Listed, Seen]) -> list[jax.ShapeDtypeStruct]:
     edges = parts[1].edges
     rows = jax.ShapeDtypeStruct((*edges.shape[:-2], len(Census._fields), edges.shape[-1]), edges.dtype)
@@ -158,4 +154,4 @@ def _call(
     return found
 
 
-_census_p = calls.make_primitive("gmem_census", _rows, _plain, make=_call)
+_census_p = calls.make_primitive("gmem_census", _rows, make=_call)

@@ -203,6 +203,22 @@ def between_steps(
     return [*found, array(grains, 14 + 3 * (spheres // grains)), array(rows, 7), array(kept, chunks, 12)]
 
 
+def aliases_of(before: Sequence[Any], arrays: Any, results: Sequence[Any]) -> dict[int, int]:
+    """The histories that a call updates in their own memory, since they are by far the largest of its arrays.
+
+    Args:
+        before: the arguments before the histories.
+        arrays: the arguments with respect to which a call can be differentiated.
+        results: the shapes of the results.
+
+    Returns:
+        For the number of an argument, the number of the result that takes its memory.
+    """
+    places = ((len(before) + number, len(arrays.fields) + 1 + number) for number in range(len(arrays.history)))
+    histories = zip(places, arrays.history, strict=True)
+    return {argument: result for (argument, result), leaf in histories if leaf.shape == results[result].shape}
+
+
 def call_kernels(target: str, call: Any, in_place: bool, parts: Any, shapes: Sequence[Any]) -> Sequence[jax.Array]:
     """A call of the library; returns the results, of the given shapes, and then the arrays of `between_steps`.
 
@@ -236,12 +252,7 @@ def call_kernels(target: str, call: Any, in_place: bool, parts: Any, shapes: Seq
     before += [arrays.offsets[..., 0], fixed.radii, fixed.sizes]
     before += [numbers, arrays.walls]
     results = [jax.ShapeDtypeStruct((entries, *shape.shape[len(outer) :]), shape.dtype) for shape in shapes]
-    aliases = {}
-    if in_place:
-        for number, leaf in enumerate(arrays.history):
-            argument, result = len(before) + number, len(arrays.fields) + 1 + number
-            if leaf.shape == results[result].shape:
-                aliases[argument] = result
+    aliases = aliases_of(before, arrays, results) if in_place else {}
     _, grains, _, replicas = arrays.fields[0].shape
     lanes = entries * replicas
     along = [type(one) is type(arrays) for one in slopes]  # else derivatives by the results: reverse mode

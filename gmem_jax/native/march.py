@@ -20,6 +20,7 @@ from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.boundary import WALLS, PeriodicAxes
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.laws import LAWS, entry_of
+from gmem_jax.physics.forces import Histories
 from gmem_jax.physics.pytree import Scalar
 from gmem_jax.physics.state import Box, Grains, State
 from gmem_jax.physics.system import System
@@ -65,7 +66,7 @@ def march_mixed(system: System, state: State, boxes: Box, dt: Scalar, drag: Scal
     return _march(system, state, boxes, dt, drag, _Mode(mixed=state.replicas > 1))
 
 
-def require_mixed(law: FrictionLaw, periodic: PeriodicAxes, equal: bool, smooth: bool = True) -> None:
+def require_mixed(law: FrictionLaw, periodic: PeriodicAxes, equal: bool, smooth: bool) -> None:
     """Refuse what cannot be done with contacts in single precision.
 
     Raises:
@@ -131,22 +132,21 @@ def _march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar, m
     return replace(state, grains=grains, history=history, cell=cell, wall_history=walls), total
 
 
-_Histories = tuple[Any, Any]  # history of the candidates, and history of walls with friction
-_Result = tuple[Grains, _Histories, jax.Array]
+_Result = tuple[Grains, Histories, jax.Array]
 _Numbers = tuple[jax.Array, jax.Array]
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _bin(
-    mode: _Mode, system: System, grains: Grains, histories: _Histories, boxes: Box, numbers: _Numbers, cell: Box | None
+    mode: _Mode, system: System, grains: Grains, histories: Histories, boxes: Box, numbers: _Numbers, cell: Box | None
 ) -> _Result:
     """The steps with walls `boxes` ([steps, 3, B]), which begin in the periodic `cell`; `numbers` are (dt, drag).
 
     Returns:
         The grains, the histories, and the sum of the wall pressures over the steps, [3, B].
     """
-    arrays = _arrays(system, grains, histories, boxes, numbers, cell)
-    definition = PlainDefinition.of(system, histories[0], mode.anywhere, boxes.periodic, histories[1])
+    arrays = arrays_of(system, grains, histories, boxes, numbers, cell)
+    definition = PlainDefinition.of(system, histories, mode.anywhere, boxes.periodic)
     call = call_of(system, boxes.periodic)._replace(mixed=int(mode.mixed))
     return _result(grains, histories, primitives.advance(call, definition, fixed_of(system), arrays))
 
@@ -175,8 +175,8 @@ def _bin_jvp(mode: _Mode, primals: tuple[Any, ...], tangents: tuple[Any, ...]) -
         # none: they only say where contacts can be.)
         _, slope = jax.jvp(lambda *varied: _plain(*filled(varied)), varied, directions)
         return _bin(mode, *primals), slope
-    arrays, along = jax.jvp(lambda *varied: _arrays(*filled(varied)), varied, directions)
-    definition = PlainDefinition.of(system, histories[0], mode.anywhere, boxes.periodic, histories[1])
+    arrays, along = jax.jvp(lambda *varied: arrays_of(*filled(varied)), varied, directions)
+    definition = PlainDefinition.of(system, histories, mode.anywhere, boxes.periodic)
     change = primitives.tangent(call_of(system, boxes.periodic), definition, fixed_of(system), arrays, along)
     return _bin(mode, *primals), _result(primals[1], histories, change)
 
@@ -186,7 +186,7 @@ def _is_zero(slope: Any) -> bool:
 
 
 def _plain(
-    system: System, grains: Grains, histories: _Histories, boxes: Box, numbers: _Numbers, cell: Box | None
+    system: System, grains: Grains, histories: Histories, boxes: Box, numbers: _Numbers, cell: Box | None
 ) -> _Result:
     """`_bin` in plain JAX."""
     history, walls = histories
@@ -221,15 +221,10 @@ class PlainDefinition:
 
     @classmethod
     def of(
-        cls,
-        system: System,
-        history: Any,
-        anywhere: bool = True,
-        periodic: PeriodicAxes = WALLS,
-        wall_history: Any = None,
+        cls, system: System, histories: Histories, anywhere: bool = True, periodic: PeriodicAxes = WALLS
     ) -> "PlainDefinition":
-        """The definition for a system with these histories."""
-        return cls(jax.tree.structure(system), jax.tree.structure((history, wall_history)), anywhere, periodic)
+        """The definition for a system with these histories, of the candidates and of the walls."""
+        return cls(jax.tree.structure(system), jax.tree.structure(histories), anywhere, periodic)
 
     def __call__(self, fixed: Fixed, arrays: Arrays) -> StepOutput:
         """The results of the steps."""
@@ -292,30 +287,17 @@ def fixed_of(system: System) -> Fixed:
 
 
 def arrays_of(
-    system: System,
-    grains: Grains,
-    history: Any,
-    boxes: Box,
-    numbers: _Numbers,
-    cell: Box | None = None,
-    wall_history: Any = None,
+    system: System, grains: Grains, histories: Histories, boxes: Box, numbers: _Numbers, cell: Box | None = None
 ) -> Arrays:
-    """The arguments of a call with respect to which it can be differentiated."""
+    """The arguments of a call with respect to which it can be differentiated, from the arguments of `_bin`."""
     walls = jnp.concatenate([boxes.lower, boxes.upper, boxes.lower_velocity, boxes.upper_velocity], axis=1)
     replicas = grains.position.shape[-1]
     parameters, offsets = _parameters(system, numbers, cell, replicas), system.clump.offsets
     centres = jnp.broadcast_to(offsets[..., None], (*offsets.shape, replicas))
-    return Arrays(jax.tree.leaves(grains), parameters, walls, centres, jax.tree.leaves((history, wall_history)))
+    return Arrays(jax.tree.leaves(grains), parameters, walls, centres, jax.tree.leaves(histories))
 
 
-def _arrays(
-    system: System, grains: Grains, histories: _Histories, boxes: Box, numbers: _Numbers, cell: Box | None
-) -> Arrays:
-    """`arrays_of` with the arguments of `_bin`."""
-    return arrays_of(system, grains, histories[0], boxes, numbers, cell, histories[1])
-
-
-def _result(grains: Grains, histories: _Histories, results: StepOutput) -> _Result:
+def _result(grains: Grains, histories: Histories, results: StepOutput) -> _Result:
     moved = jax.tree.unflatten(jax.tree.structure(grains), results.fields)
     return moved, jax.tree.unflatten(jax.tree.structure(histories), results.history), results.pressure
 

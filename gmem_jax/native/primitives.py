@@ -47,11 +47,6 @@ def tangent(call: Call, definition: Definition, fixed: Fixed, arrays: Arrays, al
 # The calls in plain JAX, for devices without the library.
 
 
-def _plain_forward(definition: Definition, fixed: Fixed, arrays: Arrays) -> StepOutput:
-    found: StepOutput = definition(fixed, arrays)
-    return found
-
-
 def _plain_tangent(definition: Definition, fixed: Fixed, arrays: Arrays, along: Arrays) -> StepOutput:
     slope: StepOutput = jax.jvp(functools.partial(definition, fixed), (arrays,), (along,))[1]
     return slope
@@ -80,7 +75,7 @@ def _no_second_tangent(*_: Any) -> StepOutput:
     )
 
 
-_forward_p = make_primitive("gmem_advance", of_results, _plain_forward, in_place=True)
+_forward_p = make_primitive("gmem_advance", of_results, in_place=True)
 _tangent_p = make_primitive("gmem_tangent", of_results, _plain_tangent)
 _adjoint_p = make_primitive("gmem_adjoint", of_arrays, _plain_adjoint)
 

@@ -156,8 +156,8 @@ def _loads(
     with jax.named_scope("contacts"):
         contact, history, through = contact_forces(system, table, histories[0], dt, alive, cell)
     with jax.named_scope("walls"):
-        solid, radii = (material.wall_stiffness, material.normal_damping), system.clump.sphere_radii(len(table))
-        lower, upper = wall_forces(table[:, :3], table[:, 3:6], box, *solid, radii)
+        radii = system.clump.sphere_radii(len(table))
+        lower, upper = wall_forces(table, box, material, material.normal_damping, radii)
         rubbing, walls = None, histories[1]
         if system.wall_mu is not None:
             _, force, torque, walls = _fusion_barrier(alive, wall_loads, system, grains, box, lower, upper, walls, dt)

@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from gmem_jax.physics.numbers import is_real, require_numbers, said
 from gmem_jax.physics.pytree import Scalar, label, pytree, static, traced
@@ -104,6 +105,16 @@ class Clump:
     def volume(self, grains: int) -> jax.Array:
         """Volume of all `grains` of a pack together, in R^3; scalar or [B]."""
         return grains * self.mass if self.sizes is None else jnp.sum(self.sizes**3) * self.mass
+
+
+def radii_of_spheres(
+    grains: int, per_grain: int, radii: ArrayLike | None = None, sizes: ArrayLike | None = None
+) -> np.ndarray:
+    """Radii of the spheres of N grains, [N K], in R; `radii` and `sizes` are those of a `Clump`."""
+    of_one, of_grains = (
+        np.ones(count) if own is None else np.asarray(own) for count, own in ((per_grain, radii), (grains, sizes))
+    )
+    return np.outer(of_grains, of_one).ravel()
 
 
 def words_of_sizes(clump: Clump) -> str:

@@ -10,11 +10,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from gmem_jax.physics.boundary import WALLS, PeriodicAxes
 from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.pytree import pytree
-from gmem_jax.physics.rotation import matrix
+from gmem_jax.physics.rotation import matrix, matrix_rows
 from gmem_jax.physics.state import Box, Grains
 
 
@@ -75,6 +76,23 @@ def sphere_centres(grains: Grains, clump: Clump) -> jax.Array:
     """Sphere centres, [S, 3, B]."""
     centres = grains.position[:, None] + sphere_offsets(grains.quaternion, clump)
     return centres.reshape(-1, *centres.shape[2:])
+
+
+def sphere_places(
+    position: ArrayLike, quaternion: ArrayLike, offsets: ArrayLike, sizes: ArrayLike | None = None
+) -> np.ndarray:
+    """Sphere centres [N K, 3] of grains [N, 3], [N, 4]; `sphere_centres` without JAX, which compiles for each N.
+
+    Args:
+        position: grain centres, in R.
+        quaternion: body-to-lab rotations (w, x, y, z).
+        offsets: sphere centres in the grain's frame, [K, 3], in R.
+        sizes: sizes of the grains, [N]; None where all are 1.
+    """
+    turned = np.einsum("ijn,kj->nki", np.array(matrix_rows(*np.asarray(quaternion).T)), np.asarray(offsets))
+    if sizes is not None:
+        turned = turned * np.asarray(sizes)[:, None, None]
+    return np.asarray((np.asarray(position)[:, None] + turned).reshape(-1, 3))
 
 
 def touching_distance(pairs: Pairs, clump: Clump) -> jax.Array | float:

@@ -1,5 +1,7 @@
 """Vectors and unit quaternions stored along the second-to-last axis, [..., 3 or 4, B]."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
@@ -18,13 +20,17 @@ def cross(a: jax.Array, b: jax.Array) -> jax.Array:
 
 def matrix(quaternion: jax.Array) -> jax.Array:
     """Rotation matrices [..., 3, 3, B] (lab components of body vectors) of unit quaternions [..., 4, B]."""
-    w, x, y, z = (quaternion[..., k, :] for k in range(4))
-    rows = [
+    rows = matrix_rows(*(quaternion[..., k, :] for k in range(4)))
+    return jnp.stack([jnp.stack(row, axis=-2) for row in rows], axis=-3)
+
+
+def matrix_rows(w: Any, x: Any, y: Any, z: Any) -> list[list[Any]]:
+    """The rows of the rotation matrix of a unit quaternion (w, x, y, z), in JAX or NumPy."""
+    return [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    return jnp.stack([jnp.stack(row, axis=-2) for row in rows], axis=-3)
 
 
 def turn(quaternion: jax.Array, angle: jax.Array) -> jax.Array:

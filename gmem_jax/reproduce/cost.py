@@ -1,33 +1,40 @@
-"""The points of figures, claims and choices as one sweep, to estimate their cost."""
+"""The points of figures, claims and choices, as sweeps: to run them, and to estimate the cost of several."""
 
 import json
 from collections.abc import Collection
 
 from gmem_jax.reproduce import choices, claims
-from gmem_jax.reproduce.figures import FIGURES, Scale, Values, packs, scale_of, shown_packs
+from gmem_jax.reproduce.figures import FIGURES, GALLERY, SCALES, packs, scale_of, shown_packs
 from gmem_jax.sweeps.making import AS_THEY_ARE
 from gmem_jax.sweeps.spec import Spec
 
 
-def spec_of_all(names: Collection[str], scale: str) -> Spec:
-    """The sweep of all points that some figures, "claims" or "choices" need, each once.
+def spec_for(name: str, scale: str) -> Spec:
+    """The sweep of all points that a figure of `FIGURES`, the packs of `GALLERY`, "claims" or "choices" need.
+
+    The last point of the claims is that of a pack of spheres. All values of a choice are run on the same packs.
 
     Raises:
         ValueError: if there is no such scale.
     """
-    size = scale_of(scale)
-    wanted = [_at(size, values) for name in names if name in FIGURES for values in FIGURES[name].points(size)]
-    if "claims" in names:
-        (named,), (spheres,) = packs(size, size.grains, 1), packs(size, size.grains, 1, shape="sphere")
-        wanted += [_at(size, values) for values in (*claims.claim_points([named]), spheres)]
-    if "choices" in names:
-        own = scale_of(scale, choices.SIZES)
-        wanted += [_at(own, values) for values in choices.choice_points(packs(own, own.grains, own.few))]
-    if list(names) == ["fig03"]:  # it needs only packs; figures 11 and 12b have them, too
-        wanted = [_at(size, values) for values in shown_packs(size)]
+    size = scale_of(scale, choices.SIZES if name == "choices" else SCALES)
+    if name == "claims":
+        points = [*claims.claim_points(packs(size, size.grains, 1)), *packs(size, size.grains, 1, shape="sphere")]
+    elif name == "choices":
+        points = choices.choice_points(packs(size, size.grains, size.few))
+    else:
+        points = shown_packs(size) if name == GALLERY else FIGURES[name].points(size)
+    return Spec(shared={"t0": size.t0}, extra=tuple(points), run={AS_THEY_ARE: True} if name == "choices" else {})
+
+
+def spec_for_all(names: Collection[str], scale: str) -> Spec:
+    """The sweep of all points that several of these need, each once.
+
+    Raises:
+        ValueError: if there is no such scale.
+    """
+    needed = [name for name in names if name != GALLERY] or names  # figures 11 and 12b have the packs of the gallery
+    specs = [spec_for(name, scale) for name in needed]
+    wanted = [{**spec.shared, **values} for spec in specs for values in spec.extra]
     once = {json.dumps(values, sort_keys=True): values for values in wanted}
     return Spec(extra=tuple(once.values()), run={AS_THEY_ARE: True})
-
-
-def _at(size: Scale, values: Values) -> Values:
-    return {"t0": size.t0, **values}

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from gmem_jax.experiment.experiment import PAPER_T0
 from gmem_jax.files.cache import list_packs
-from gmem_jax.sweeps.spec import PREPARE, Spec
+from gmem_jax.sweeps.spec import PREPARE
 
 Values = dict[str, Any]
 """Names of a sweep file with the values of one point."""
@@ -182,6 +182,7 @@ def _words(scale: Scale) -> list[Values]:
     return crossed(_one(scale), lengths)
 
 
+GALLERY = "fig03"  # pictures of packs, some of which may have to be made
 FIGURES = {
     "fig04": PaperFigure("phi, Z and pressures through the experiment, with signal 5 and with none", _one),
     "fig06": PaperFigure("six recalled waveforms beside their integrals", _standard),
@@ -196,8 +197,3 @@ FIGURES = {
     "fig13": PaperFigure("Recalled words", _words),
     "fig14": PaperFigure("F by three backgrounds, and accuracy, against the length of words", _words, ("bits",)),
 }
-
-
-def figure_spec(figure: PaperFigure, scale: Scale) -> Spec:
-    """The sweep that a figure needs."""
-    return Spec(shared={"t0": scale.t0}, extra=tuple(figure.points(scale)))

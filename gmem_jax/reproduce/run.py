@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 from gmem_jax.bench.measure import rival
 from gmem_jax.errors import RunFailedError
@@ -33,18 +33,17 @@ from gmem_jax.reproduce.compare import (
     points_of,
     write_csv,
 )
-from gmem_jax.reproduce.cost import spec_of_all
+from gmem_jax.reproduce.cost import spec_for, spec_for_all
 from gmem_jax.reproduce.dataset import COLLECTED, write_dataset
 from gmem_jax.reproduce.figures import (
     FIGURES,
+    GALLERY,
     SHOWN_WORD,
     PaperFigure,
     Scale,
     Values,
-    figure_spec,
     packs,
     scale_of,
-    shown_packs,
 )
 from gmem_jax.reproduce.single_contact import convergence_figure, laws_figure
 from gmem_jax.reproduce.two_grains import two_grains_figure
@@ -55,7 +54,6 @@ from gmem_jax.show.render_matplotlib import to_matplotlib
 from gmem_jax.simulation.compiled import require_x64
 from gmem_jax.simulation.progress import Progress, silent
 from gmem_jax.sweeps.executors import Executor, Processes
-from gmem_jax.sweeps.making import AS_THEY_ARE
 from gmem_jax.sweeps.spec import PREPARE, Spec
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.sweep import SECONDS_PER_GRAIN_STEP, SIDE_BY_SIDE, SweepRunner, Tell
@@ -63,6 +61,9 @@ from gmem_jax.sweeps.table import doubts, rows
 
 RUNS = "runs"  # the folder of the sweep that all figures share
 MOST_SHOWN = 8  # words of a length in Fig. 13
+
+
+_Row = TypeVar("_Row")  # a measure beside the published one, or an effect of a choice
 
 
 class Schematic(NamedTuple):
@@ -85,35 +86,20 @@ SCHEMATICS = {
     "fig10": Schematic("one contact under every law, beside closed forms", laws_figure, has_numbers=True),
     "fig15": Schematic("M2 with more and more points", convergence_figure, has_numbers=True),
 }
-GALLERY = "fig03"  # pictures of packs, some of which may have to be made
 
 
-class Weighed(NamedTuple):
-    """The effects of the choices that the paper leaves open.
-
-    Attributes:
-        effects: effects of every value of every choice.
-        files: the files written.
-        failed: reasons of points that failed.
-    """
-
-    effects: list[Effect]
-    files: list[Path]
-    failed: list[str]
-
-
-class Outcome(NamedTuple):
-    """The result of a figure.
+class Outcome(NamedTuple, Generic[_Row]):
+    """What a figure, or the choices that the paper leaves open, resulted in.
 
     Attributes:
-        name: name of the figure.
-        rows: its measures beside the published ones.
+        name: name of the figure, or "choices".
+        rows: the measures of a figure beside the published ones, or the effects of every value of every choice.
         files: the files written.
         failed: reasons of points that failed.
     """
 
     name: str
-    rows: list[Compared]
+    rows: list[_Row]
     files: list[Path]
     failed: list[str]
 
@@ -143,7 +129,7 @@ class Reproduction:
     say: Tell = print
     statuses: list[int] = field(default_factory=list, compare=False)
 
-    def figure(self, name: str) -> Outcome:
+    def figure(self, name: str) -> Outcome[Compared]:
         """Run the missing points of a figure of `FIGURES`, and write its picture (PNG, SVG) and its table (CSV).
 
         Raises:
@@ -155,7 +141,7 @@ class Reproduction:
         size, figure = scale_of(self.scale), FIGURES[name]
         if name == "fig14":
             (self.folder / "nets").mkdir(parents=True, exist_ok=True)
-        store = self._run(figure_spec(figure, size)).store
+        store = self._run(spec_for(name, self.scale)).store
         points, failed = points_of(store), _failed(store)
         if not points:
             return Outcome(name, [], [], failed)
@@ -178,28 +164,25 @@ class Reproduction:
             target = self.folder / f"{name}.png"
             self.say(f"{name}: {SCHEMATICS[name].draw(target) or 'drawn'}")
             return _written(target)[: None if SCHEMATICS[name].has_numbers else -1]
-        size = scale_of(self.scale)
-        runner = self._runner(Spec(shared={"t0": size.t0}, extra=tuple(shown_packs(size))))
+        runner = self._runner(spec_for(GALLERY, self.scale))
         shown, target = runner.packs(self.executor or Processes(), self.progress), self._target(name)
         packs_figure(target, shown, "Packs at rest, by size and by shape")
         return [target]
 
-    def sensitivity(self) -> Weighed:
+    def sensitivity(self) -> Outcome[Effect]:
         """Run every choice that the paper leaves open with other values, on the same packs, and write choices-SCALE."""
         size = scale_of(self.scale, choices.SIZES)
         named = packs(size, size.grains, size.few)
-        same = {AS_THEY_ARE: True}  # all values of a choice are run on the same packs
-        spec = Spec(shared={"t0": size.t0}, extra=tuple(choices.choice_points(named)), run=same)
-        store = self._run(spec).store
+        store = self._run(spec_for("choices", self.scale)).store
         done = store.done()
         points = [row for row in store.card()["points"] if row["key"] in done]
         runs = [(row["values"], summary(store.load(row["key"]))) for row in points]
         found, target = choices.effects(named, runs, size.t0), self._target("choices")
         if not found:
-            return Weighed([], [], _failed(store))
+            return Outcome("choices", [], [], _failed(store))
         write_csv(target.with_suffix(".csv"), choices.effect_rows(found))
         choices.draw(target, found, choices.choices_title(size, found[0].gain.packs))
-        return Weighed(found, _written(target), _failed(store))
+        return Outcome("choices", found, _written(target), _failed(store))
 
     def dataset(self) -> tuple[list[Path], list[str]]:
         """Run the missing points of the figures `COLLECTED`, and write their recalls as one archive, dataset-SCALE.zip.
@@ -208,7 +191,7 @@ class Reproduction:
             The files written, and the reasons of points that failed.
         """
         require_x64()
-        store = self._run(spec_of_all(COLLECTED, self.scale)).store
+        store = self._run(spec_for_all(COLLECTED, self.scale)).store
         points, target = points_of(store), self._target("dataset", ".zip")
         if points:
             write_dataset(target, store, points, self.scale, scale_of(self.scale).t0)
@@ -220,17 +203,14 @@ class Reproduction:
         Raises:
             RunFailedError: if a point failed, so that a claim cannot be tested.
         """
-        size = scale_of(self.scale)
-        (named,) = packs(size, size.grains, 1)
-        (spheres,) = packs(size, size.grains, 1, shape="sphere")
-        spec = Spec(shared={"t0": size.t0}, extra=(*claims.claim_points([named]), spheres))
+        spec = spec_for("claims", self.scale)
         runner = self._run(spec)
         store = runner.store
         if failed := _failed(store):
             raise RunFailedError(failed[0])
         runs = [(row["values"], store.load(row["key"])) for row in store.card()["points"]]
         tetra, sphere = (runner.pack_of({**spec.shared, **runs[place][0]}) for place in (0, -1))
-        found = claims.verdicts(tetra, size.t0, runs[:-1], {"sphere": sphere})
+        found = claims.verdicts(tetra, spec.shared["t0"], runs[:-1], {"sphere": sphere})
         with atomic(self._target("claims", ".json")) as path:
             path.write_text(json.dumps([verdict._asdict() for verdict in found], indent=1) + "\n", encoding="utf-8")
         return found
@@ -343,7 +323,7 @@ def _shown(bits: int) -> list[int]:
     return [SHOWN_WORD - 1] if bits == 10 else chosen
 
 
-def outcome_summary(outcome: Outcome) -> dict[str, Any]:
+def outcome_summary(outcome: Outcome[Compared]) -> dict[str, Any]:
     """An outcome as JSON."""
     lines = [
         {

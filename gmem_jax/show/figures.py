@@ -11,12 +11,11 @@ from gmem_jax.design.waveforms import Design
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.record import names_of
 from gmem_jax.experiment.signals import Signals
+from gmem_jax.physics.grain import radii_of_spheres
 from gmem_jax.physics.material import Material
-from gmem_jax.physics.pairs import sphere_centres
-from gmem_jax.physics.state import Grains
+from gmem_jax.physics.pairs import sphere_places
 from gmem_jax.show.figure import Curve, Discs, Figure, Image, Panel, U, grid, ramp, shown_part, u_label
 from gmem_jax.show.recalls import MOST_OF_PAGE, SHEAR
-from gmem_jax.simulation.frames import radii_of_spheres
 from gmem_jax.simulation.stage import BINS
 
 PASCAL = float(Material().modulus)
@@ -41,10 +40,9 @@ def lines_figure(lines: Mapping[str, tuple[Any, Any]], x: str, y: str, title: st
 
 def grains_figure(pack: Pack) -> Figure:
     """The spheres of all grains, seen from above along z; higher ones are brighter."""
-    still = jnp.zeros((*pack.position.shape, 1))
-    grains = Grains(pack.position[..., None], pack.quaternion[..., None], still, still, still, still)
-    centres = np.asarray(sphere_centres(grains, pack.clump))[..., 0]
-    clump, order = pack.clump, np.argsort(centres[:, 2])
+    clump = pack.clump
+    centres = sphere_places(pack.position, pack.quaternion, clump.offsets, clump.sizes)
+    order = np.argsort(centres[:, 2])
     radii = radii_of_spheres(pack.grains, clump.spheres, clump.radii, clump.sizes)
     centres = centres[order]
     (left, right), (front, back) = zip(*(np.asarray(each)[:2] for each in (pack.lower, pack.upper)), strict=True)

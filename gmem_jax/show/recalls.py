@@ -93,7 +93,7 @@ def recall_figure(
     t0 = values_of(known).get("t0")
     if found in quantities:
         chosen = {names[number - 1] if number else ZERO: number for number in signals}
-        own: dict[str, Any] = {"against": against, "t0": t0, "chosen": chosen}
+        own: dict[str, Any] = {"against": against, "begins": recall.protocol.begins, "t0": t0, "chosen": chosen}
         return stages_figure(recall.stages, quantities[found], title, material=recorded_material(known), **own)
     scale = relative_scale(known) if known else None
     if signals:

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from gmem_jax.experiment.pack import Pack
-from gmem_jax.physics.pairs import sphere_offsets
+from gmem_jax.physics.grain import radii_of_spheres
+from gmem_jax.physics.pairs import sphere_places
 from gmem_jax.show.render_matplotlib import pyplot, save_picture
 
 VIEW = (np.deg2rad(-35.0), np.deg2rad(25.0))  # azimuth and elevation of the eye
@@ -64,10 +65,10 @@ def rendered(centres: np.ndarray, colour: np.ndarray, pixels: int = 700, radii: 
 
 def pack_image(pack: Pack, pixels: int = 700) -> np.ndarray:
     """An image of a pack; see `rendered`."""
-    centres = pack.position[:, None] + sphere_offsets(pack.quaternion[..., None], pack.clump)[..., 0]
-    tints = np.repeat(colours(pack.grains), pack.clump.spheres, axis=0)
-    own = pack.clump.sphere_radii(len(tints))
-    return rendered(np.asarray(centres).reshape(-1, 3), tints, pixels, None if own is None else np.asarray(own))
+    clump = pack.clump
+    centres = sphere_places(pack.position, pack.quaternion, clump.offsets, clump.sizes)
+    radii = radii_of_spheres(pack.grains, clump.spheres, clump.radii, clump.sizes)
+    return rendered(centres, np.repeat(colours(pack.grains), clump.spheres, axis=0), pixels, radii)
 
 
 def packs_figure(path: Path, packs: Sequence[Pack], title: str, columns: int = 4) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from gmem_jax.files.validation import is_number
 from gmem_jax.physics.material import Material
 from gmem_jax.show.figure import CYCLE, GREY, Curve, Figure, Panel, U
-from gmem_jax.simulation.sample import MEASURED, Measured, Sample
+from gmem_jax.simulation.sample import MEASURED, Measured, Sample, ends_of_bins
 from gmem_jax.simulation.stage import BINS
 
 AGAINST = ("time", "u")
@@ -112,6 +112,7 @@ def stages_figure(
     title: str,
     *,
     against: str = "time",
+    begins: Mapping[str, int] | None = None,
     t0: Any = None,
     chosen: Mapping[str, int] = NO_CHOICE,
     material: Material = Material(),
@@ -125,12 +126,13 @@ def stages_figure(
         quantity: one of `QUANTITIES`, or of `observed_quantities`.
         title: title above the picture.
         against: horizontal axis: "time"; or "u", for the stages in which u changes.
+        begins: see `ends_of_bins`.
         t0: duration of a compression, in t_c; without it the time axis is in t0.
         chosen: numbers of the signals to draw, by name; 0 is the zero signal.
         material: the material, for stresses in Pa.
     """
     marks = []
-    time, spans = _times(stages, t0)
+    time, spans = _times(stages, begins, t0)
     moving = [name for name, sample in stages.items() if np.ptp(np.asarray(sample.u)[:, 0]) > 0.0]
     for name in stages if against == "time" else moving:
         sample, place = stages[name], moving.index(name) if name in moving else 0
@@ -162,15 +164,13 @@ def _of_signals(curves: Mapping[str, np.ndarray], chosen: Mapping[str, int]) -> 
     }
 
 
-def _times(stages: Mapping[str, Sample], t0: Any) -> tuple[dict[str, np.ndarray], tuple[tuple[float, float, str], ...]]:
+def _times(
+    stages: Mapping[str, Sample], begins: Mapping[str, int] | None, t0: Any
+) -> tuple[dict[str, np.ndarray], tuple[tuple[float, float, str], ...]]:
     """The times of the ends of bins by stage; and begin, end and name of each stage."""
-    tick, passed, times, spans = (t0 if is_number(t0) else 1.0) / BINS, 0, {}, []
-    for name, sample in stages.items():
-        bins = len(sample.filling)
-        times[name] = tick * (passed + np.arange(1, bins + 1))
-        spans.append((tick * passed, tick * (passed + bins), name))
-        passed += bins
-    return times, tuple(spans)
+    unit = t0 if is_number(t0) else 1.0
+    times = {name: unit * ends for name, ends in ends_of_bins(stages, begins).items()}
+    return times, tuple((ends[0] - unit / BINS, ends[-1], name) for name, ends in times.items())
 
 
 def _time_label(t0: Any) -> str:
@@ -178,7 +178,11 @@ def _time_label(t0: Any) -> str:
 
 
 def series_figures(
-    stages: Mapping[str, Sample], names: Sequence[str], t0: Any, material: Material = Material()
+    stages: Mapping[str, Sample],
+    names: Sequence[str],
+    t0: Any,
+    begins: Mapping[str, int] | None = None,
+    material: Material = Material(),
 ) -> dict[str, Figure]:
     """Pressures, coordination and filling along a whole run, with a line for the zero signal and the first six others.
 
@@ -186,12 +190,13 @@ def series_figures(
         stages: samples by name, in order.
         names: names of the signals; none for a preparation.
         t0: duration of a compression, in t_c; not a number if it differs between replicas.
+        begins: see `ends_of_bins`.
         material: the material, for stresses in Pa.
 
     Returns:
         The figure against time and the figure against u, by the text of their buttons.
     """
-    time, spans = _times(stages, t0)
+    time, spans = _times(stages, begins, t0)
     u = [np.asarray(sample.u)[:, 0] for sample in stages.values()]
     called = {ZERO if names else "preparation": 0} | {name: number for number, name in enumerate(names[: LINES - 1], 1)}
     ways = {"time": (time.values(), _time_label(t0), spans), "u": (u, U, ())}

@@ -188,14 +188,13 @@ def _parts_of_recall(recall: Recall, row: dict[str, Any]) -> Iterator[Part]:
         figure = signals_figure(one, names, "", scale, t0, target=target, page=True)
         yield Part(figure, f"Recalled signals{place_of(recall, one)}{shown}")
     material = recorded_material(configuration)
-    yield from _series(recall.stages, names, t0, material, "Along the run")
+    yield from _series("Along the run", recall.stages, names, t0, recall.protocol.begins, material)
     yield from _grains(recall, names, material)
 
 
-def _series(
-    stages: Mapping[str, Sample], names: Sequence[str], t0: Any, material: Material, heading: str
-) -> Iterator[Part]:
-    yield Part(series_figures(stages, names, t0, material), heading)
+def _series(heading: str, stages: Mapping[str, Sample], *more: Any) -> Iterator[Part]:
+    """Figures of all stages; `more` are the other arguments of `series_figures`."""
+    yield Part(series_figures(stages, *more), heading)
     yield Part(f"Stages, white and grey in turn: {', '.join(stages)}.")
 
 
@@ -233,7 +232,7 @@ def of_pack(
     def parts() -> Iterator[Part]:
         yield Part(GrainView(lambda: frames_of_pack(pack, material), material, pack_fingerprint(pack)))
         if kept:
-            yield from _series(kept, [], t0, material, "Its preparation")
+            yield from _series("Its preparation", kept, [], t0, None, material)
         if frames is not None:
             yield Part(GrainView(lambda: frames, material))
 

@@ -16,8 +16,9 @@ import numpy as np
 from gmem_jax.physics.boundary import WALLS, PeriodicAxes
 from gmem_jax.physics.contact.wall import PLANES, wall_forces
 from gmem_jax.physics.forces import contact_loads, relative_motion, sphere_table, wall_loads
-from gmem_jax.physics.grain import Clump
+from gmem_jax.physics.grain import Clump, radii_of_spheres
 from gmem_jax.physics.numbers import require_numbers
+from gmem_jax.physics.pairs import sphere_places
 from gmem_jax.physics.pytree import map_numbers, pytree, short_repr, static
 from gmem_jax.physics.state import State, still_box
 from gmem_jax.physics.system import System
@@ -116,39 +117,6 @@ def images_met(frames: Frames, number: int) -> np.ndarray:
     one, other = frames.spheres[slice(*frames.start[number : number + 2])].T
     nearest = -lengths * np.rint((centres[other] - centres[one]) / lengths)
     return np.where(frames.periodic, nearest, 0.0)
-
-
-def radii_of_spheres(
-    grains: int, per_grain: int, radii: jax.typing.ArrayLike | None = None, sizes: jax.typing.ArrayLike | None = None
-) -> np.ndarray:
-    """Radii of the spheres of N grains, [N K], in R; `radii` and `sizes` are those of a `Clump`."""
-    of_one, of_grains = (
-        np.ones(count) if own is None else np.asarray(own) for count, own in ((per_grain, radii), (grains, sizes))
-    )
-    return np.outer(of_grains, of_one).ravel()
-
-
-def sphere_places(
-    position: np.ndarray, quaternion: np.ndarray, offsets: np.ndarray, sizes: np.ndarray | None = None
-) -> np.ndarray:
-    """Sphere centres [N K, 3] of grains [N, 3], [N, 4]; `pairs.sphere_centres` without JAX, which compiles for each N.
-
-    Args:
-        position: grain centres, in R.
-        quaternion: body-to-lab rotations (w, x, y, z).
-        offsets: sphere centres in the grain's frame, [K, 3], in R.
-        sizes: sizes of the grains, [N]; None where all are 1.
-    """
-    w, x, y, z = np.asarray(quaternion).T
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    turned = np.einsum("ijn,kj->nki", np.array(rows), offsets)
-    if sizes is not None:
-        turned = turned * np.asarray(sizes)[:, None, None]
-    return np.asarray((np.asarray(position)[:, None] + turned).reshape(-1, 3))
 
 
 Recorded = Mapping[str, tuple[Frame, ...]]
@@ -315,7 +283,7 @@ def _rubbing(system: System, state: State, lower: jax.Array, upper: jax.Array) -
     box = still_box(lower, upper) if cell is None else replace(cell, lower=lower, upper=upper)
     table, _ = sphere_table(system.clump, state.grains, cell)
     radii = system.clump.sphere_radii(len(table))
-    normal = wall_forces(table[:, :3], table[:, 3:6], box, system.material.wall_stiffness, 0.0, radii)
+    normal = wall_forces(table, box, system.material, 0.0, radii)
     _, force, _, _ = wall_loads(system, state.grains, box, *normal, state.wall_history, jnp.zeros(()))
     return force.reshape(-1, PLANES, *force.shape[1:])
 

@@ -368,9 +368,8 @@ class _Seen(NamedTuple):
         """Normal forces of the lower and upper walls on spheres, [S, 3, B] each; default the material's damping."""
         material = simulation.system.material
         damping = material.normal_damping if damping_time is None else damping_time
-        places, velocities = self.table[:, :3], self.table[:, 3:6]
-        radii = simulation.system.clump.sphere_radii(len(places))
-        return wall_forces(places, velocities, _known(simulation.box), material.wall_stiffness, damping, radii)
+        radii = simulation.system.clump.sphere_radii(len(self.table))
+        return wall_forces(self.table, _known(simulation.box), material, damping, radii)
 
     def rubbed(self, simulation: Simulation, state: State) -> tuple[Kinematics, jax.Array] | None:
         """Kinematics of spheres at walls, and friction forces of walls on them, [6 S, ...]; None at smooth walls."""

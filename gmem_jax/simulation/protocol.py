@@ -111,6 +111,12 @@ class Protocol:
         return common, self.stages[len(common) :]
 
     @property
+    def begins(self) -> dict[str, int]:
+        """Number of bins before each stage, by name."""
+        firsts = itertools.accumulate((stage.bins for stage in self.stages), initial=0)
+        return {stage.name: first for stage, first in zip(self.stages, firsts, strict=False)}
+
+    @property
     def columns(self) -> Columns:
         """The columns of its table of bins."""
         return columns_of(self.stages)

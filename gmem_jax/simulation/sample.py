@@ -1,10 +1,13 @@
 """Samples: the quantities that are recorded of every bin; and the checks at its end."""
 
+import itertools
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from gmem_jax.physics.census import Census, TakeCensus, take_census
@@ -16,6 +19,7 @@ from gmem_jax.physics.pytree import Scalar, pytree, short_repr
 from gmem_jax.physics.rotation import matrix
 from gmem_jax.physics.state import Box, State, Status
 from gmem_jax.physics.system import System
+from gmem_jax.simulation.stage import BINS
 
 
 class Measured(NamedTuple):
@@ -128,6 +132,22 @@ MEASURED: dict[str, Measured] = {
     entry.name: entry.metadata["measured"] for entry in fields(Sample) if "measured" in entry.metadata
 }
 """The descriptions of the fields of a `Sample`, by name."""
+
+
+def ends_of_bins(stages: Mapping[str, Sample], begins: Mapping[str, int] | None = None) -> dict[str, np.ndarray]:
+    """The end of every bin of stages, by name, in t0 since the run began.
+
+    Args:
+        stages: samples by stage, in order.
+        begins: number of bins before each stage, since some may not be recorded; by default the stages follow each
+            other from the beginning.
+    """
+    counts = [len(sample.filling) for sample in stages.values()]
+    firsts = itertools.accumulate(counts, initial=0) if begins is None else map(begins.__getitem__, stages)
+    return {
+        name: (first + np.arange(1, count + 1)) / BINS
+        for name, count, first in zip(stages, counts, firsts, strict=False)
+    }
 
 
 def check(system: System, state: State, box: Box, census: Census) -> State:

@@ -132,6 +132,11 @@ class Lane(NamedTuple):
     channel: str
     waveform: str | tuple[float, ...]
 
+    @property
+    def drive(self) -> Drive:
+        """The drive of amplitude 1."""
+        return Drive(*self)
+
 
 OWN = (Drive(),)
 """Each set of waveforms on the channel of its name."""

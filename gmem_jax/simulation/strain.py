@@ -59,7 +59,6 @@ class StrainPath:
         waveforms: waveforms of each lane: one for all replicas, or one for each but replica 0, which has none.
         share: share of gamma on each axis, scalar or [B]. The paper does not say; a half is this project's reading.
         lanes: which waveforms are applied on which channel; the table of bins says when.
-        fixed: whether the waveform of each lane is the same for all replicas.
         periodic: the periodic axes of the box, whose edges are strained alike.
     """
 
@@ -70,13 +69,12 @@ class StrainPath:
     waveforms: tuple[Waveforms, ...] = ()
     share: Scalar = 0.5
     lanes: tuple[Lane, ...] = static(())
-    fixed: tuple[bool, ...] = static(())
     periodic: PeriodicAxes = static(WALLS)
 
     def _shear(self, lane: int, at: jax.Array, amplitude: Numbers) -> jax.Array:
         """share gamma of one lane, [B] or [1]."""
         shapes = self.waveforms[lane].shear(at)
-        if not self.fixed[lane]:
+        if not self.lanes[lane].drive.fixed:
             shapes = jnp.concatenate([jnp.zeros((*at.shape, 1)), shapes], axis=-1)
         elif at.ndim:
             shapes = jnp.broadcast_to(shapes, (*at.shape, at.shape[-1]))

@@ -4,12 +4,14 @@ import json
 from pathlib import Path
 
 import h5py
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes import gmem
 from test_cli import PACK, SHORT
 
 import gmem_jax as gm
+from gmem_jax.command.derive import _of_waveforms, _waveform_of
 from gmem_jax.files.schemas import KERNEL
 
 
@@ -53,7 +55,7 @@ def test_a_design_goes_on_from_a_file(
     np.testing.assert_allclose(gm.load_waveforms(tmp_path / "designed.csv")[0].max(), samples.max(), rtol=0.1)
 
 
-def test_gradient_prints_finite_slopes_of_everything(
+def test_gradient_prints_the_slopes_of_the_library(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
 ) -> None:
     waves = tmp_path / "one.csv"
@@ -62,9 +64,23 @@ def test_gradient_prints_finite_slopes_of_everything(
     assert gmem(monkeypatch, "gradient", PACK, "-o", target, "--signals", waves, "--json", *SHORT) == 0
     said = json.loads(capsys.readouterr().out)
     assert np.shape(said["gradient"]["waveform"]) == np.shape(said["places"]) == (1, 8)
-    assert all(np.all(np.isfinite(slope)) for slope in said["gradient"].values())
+    experiment = gm.from_dict(said["configuration"]["experiment"], gm.load_pack(PACK))
+    paths = {"gamma0": "gamma0", "mu": "friction.mu", "stiffness": "friction.stiffness"}
+    found = gm.value_and_grad(experiment, ["signals.nodes", *paths.values()])
+    np.testing.assert_allclose(said["fidelity"], found.value, rtol=1e-12)
+    np.testing.assert_allclose(said["gradient"]["waveform"], found.slope["signals.nodes"][:, 1:-1], rtol=1e-9)
+    for name, path in paths.items():
+        np.testing.assert_allclose(said["gradient"][name], found.slope[path], rtol=1e-9)
     assert json.loads(target.read_text())["fidelity"] == said["fidelity"]
     assert (tmp_path / "gradient.png").exists()
+
+
+def test_slopes_of_bumps_are_in_the_order_of_their_places() -> None:
+    bumps = gm.Bumps(jnp.asarray([[1.0, 0.0, 0.5]]), jnp.asarray([[0.7, 0.5, 0.3]]), 0.2)
+    experiment = gm.Experiment(gm.load_pack(PACK), bumps, t0=75.0)
+    ((places, slopes),) = _of_waveforms(experiment, *_waveform_of(experiment), np.asarray([[10.0, 30.0, 20.0]]))
+    np.testing.assert_array_equal(places, [0.3, 0.7])
+    np.testing.assert_array_equal(slopes, [20.0, 10.0])
 
 
 def test_tune_stays_within_bounds_and_says_what_it_found(

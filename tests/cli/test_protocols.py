@@ -12,7 +12,9 @@ from scenes import gmem
 from test_cli import PACK
 
 import gmem_jax as gm
+from gmem_jax.command.classify import _chosen
 from gmem_jax.experiment import analysis
+from gmem_jax.experiment.run import steps_of_grains
 from gmem_jax.files.sizes import recall_bytes
 from gmem_jax.reading.readers import stored_words
 from gmem_jax.show import tables
@@ -52,6 +54,19 @@ def several() -> gm.Recall:
 
 def cells(table: Any) -> list[tuple[str, ...]]:
     return list(zip(*(map(str, column.cells) for column in table.columns), strict=True))
+
+
+def test_an_accuracy_that_is_asked_for_chooses_the_drive(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    usual = gm.Experiment(gm.load_pack(PACK), gm.six_signals())
+    wanted = ["recall", PACK, "-o", tmp_path / "a.h5", "--json", "--dry-run"]
+    costs = []
+    for options in ([], ["--accuracy", 0.1]):
+        assert gmem(monkeypatch, *wanted, *options) == 0
+        costs.append(json.loads(capsys.readouterr().out)["grain_steps"])
+    assert costs == [steps_of_grains(one, 6) for one in (usual, gm.at_accuracy(usual, 0.1))]
+    assert costs[0] != costs[1]
 
 
 def test_a_protocol_in_a_file_is_recalled_and_its_cost_is_told(
@@ -151,6 +166,8 @@ def test_words_of_one_read_and_channel_are_read(
     gm.save_recall(tmp_path / "a.h5", recall)
     assert gmem(monkeypatch, "classify", tmp_path / "a.h5", "-o", tmp_path / "out.json") == 2
     assert "say --read, one of read, read-2" in capsys.readouterr().err
+    chosen = _chosen(several, tmp_path / "b.h5", "two", "z")
+    np.testing.assert_array_equal(chosen.p_sig, several.at("two", "z").p_sig)
 
 
 def test_backgrounds_are_those_of_the_channel() -> None:

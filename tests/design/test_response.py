@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,6 +17,7 @@ from gmem_jax.design import by_kernel, drive, waveforms
 from gmem_jax.design import kernel as response
 from gmem_jax.experiment.run import prefix_of, run
 from gmem_jax.experiment.signals import bin_average
+from gmem_jax.show import summaries
 from gmem_jax.simulation.checkpoints import NO_CHECKPOINT, Checkpoint, ResultCache
 from gmem_jax.simulation.stage import BINS
 
@@ -63,6 +65,45 @@ def test_singular_values_are_recalls_of_unit_waveforms() -> None:
     np.testing.assert_allclose(kernel.singular_values(), expected, rtol=1e-6)
     assert kernel.capacity(0.5 * expected[1]) == 2
     assert kernel.capacity(0.5 * (expected[0] + expected[1])) == 1
+
+
+def test_asymmetry_is_the_even_part_over_the_odd_one() -> None:
+    kernel = ideal(0.3)
+    np.testing.assert_allclose(replace(kernel, even=0.1 * kernel.odd[::-1]).asymmetry(), 0.1, rtol=1e-12)
+
+
+def test_distance_is_the_sine_of_the_angle_to_the_integral() -> None:
+    kernel = ideal(0.3)
+    other = np.random.default_rng(1).normal(size=kernel.odd.shape)
+    other -= kernel.odd * np.sum(other * kernel.odd) / np.sum(kernel.odd**2)
+    other *= 0.75 * np.linalg.norm(kernel.odd) / np.linalg.norm(other)
+    np.testing.assert_allclose(replace(kernel, odd=kernel.odd + other).distance(), 0.6, rtol=1e-6)
+
+
+def test_resolution_of_bumps_that_do_not_overlap_is_the_width_of_each_at_half_of_its_value() -> None:
+    width, points = 0.5, response.QUADRATURE_POINTS
+    basis = response.bumps(np.eye(2), width)
+    odd = np.asarray(bin_average(basis))
+    kernel = gm.MemoryKernel(np.arange(BINS) / BINS, np.asarray(basis.centres[0]), width, odd, 0.0 * odd, 1e-3, 0.05)
+    v = (np.arange(points // 5, 4 * points // 5, points // 32) + 0.5) / points
+    height = np.cos(np.pi * (v % width - 0.5 * width) / width)  # of the bump at v
+    expected = np.mean(2.0 * width / np.pi * np.arccos(0.5 * height))
+    assert kernel.resolution(0.0) == pytest.approx(expected, abs=2.0 / points)
+
+
+def test_what_is_told_of_a_kernel_is_in_pascals() -> None:
+    kernel, modulus = ideal(0.3, n=5), float(gm.Material().modulus)
+    values = modulus * kernel.singular_values()
+    for noise, above in ((0.5 * (values[2] + values[3]), 3), (0.5 * (values[0] + values[1]), 1)):
+        facts = summaries.of_kernel(kernel, {}, noise).facts
+        assert facts["capacity"] == above
+        np.testing.assert_allclose(facts["singular_values_pa"], values, rtol=1e-12)
+        assert facts["resolution"] == kernel.resolution(noise / modulus)
+
+
+def test_the_error_of_a_prediction_is_over_what_was_simulated() -> None:
+    found = response.relative_error(np.array([[3.0, 4.0], [0.0, 2.0]]), jnp.asarray([[3.0, 2.0], [0.0, 4.0]]))
+    np.testing.assert_allclose(found, [2.0 / np.sqrt(13.0), 0.5], rtol=1e-12)
 
 
 def test_less_noise_means_finer_resolution() -> None:

@@ -248,6 +248,10 @@ def test_waveforms_of_another_formula_are_others() -> None:
     bumps = [kind(jnp.ones((1, 1)), jnp.full((1, 1), 0.5), 0.2) for kind in (gm.Bumps, Louder)]
     keys = [key_of_run(gm.Experiment(PACK, signals)) for signals in bumps]
     assert keys[0] != keys[1]
+    louder = gm.Experiment(PACK, bumps[1])
+    assert gm.to_dict(louder)["signals"].keys() == {"kind", "sha256"}
+    with pytest.raises(ValueError, match="Louder"):
+        gm.from_dict(gm.to_dict(louder), PACK)
 
 
 def _height(factor: float) -> Callable[..., Any]:

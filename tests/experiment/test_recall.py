@@ -10,6 +10,7 @@ from scenes import SPHERE, TETRA_27, scene
 
 import gmem_jax as gm
 from gmem_jax.experiment.recall import Recall, finish
+from gmem_jax.files.measures import of_each
 from gmem_jax.physics.state import Status
 from gmem_jax.simulation.sample import MEASURED, Sample, end_bin
 
@@ -27,15 +28,16 @@ def experiment() -> gm.Experiment:
     return gm.Experiment(PACK, bumps, t0=15.0 * float(PACK.ringing_period), dt=0.3)
 
 
-def finished(speed: object = 0.0, ripple: float = 0.0, status: object = 0) -> Recall:
+def finished(speed: object = 0.0, ripple: float = 0.0, status: object = 0, one: gm.Experiment | None = None) -> Recall:
     """The recall of a perfect memory whose gain is 0.3, with a ripple of the ringing period beside it.
 
     Args:
         speed: largest grain speed when the readout began, over the walls' speed, [3].
         ripple: its amplitude, in that of the recall.
         status: bits of the run, [3].
+        one: the experiment, if not that of `experiment`.
     """
-    one = experiment()
+    one = one or experiment()
     signal = 0.3 * one.scale * one.integral()
     wave = jnp.sin(2.0 * jnp.pi * 15.0 * (jnp.arange(256) + 0.5) / 256.0)
     rows = jnp.concatenate([jnp.zeros((1, 256)), -signal - ripple * jnp.abs(signal).max() * wave])
@@ -59,6 +61,15 @@ def test_a_perfect_memory_has_its_gain_and_a_fidelity_of_one() -> None:
     np.testing.assert_allclose(found.gain, 0.3, rtol=1e-12)
     np.testing.assert_allclose(found.fidelity, 1.0, atol=1e-7)  # the square root of round-off
     np.testing.assert_array_equal(found.status, 0)
+
+
+def test_each_replica_may_have_a_shear_of_its_own() -> None:
+    one = gm.replace(experiment(), gamma0=jnp.asarray([9e-3, 1e-3, 3e-3]))
+    found = finished(one=one)
+    np.testing.assert_allclose(found.gain, 0.3, rtol=1e-12)
+    np.testing.assert_allclose(found.fidelity, 1.0, atol=1e-7)
+    each = of_each(found.described(gm.describe(one)))
+    np.testing.assert_allclose(each["signal_gain"], 0.3, rtol=1e-12)
 
 
 def test_the_window_is_the_ringing_period_in_bins_and_takes_ringing_out() -> None:

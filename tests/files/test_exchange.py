@@ -18,8 +18,9 @@ from gmem_jax.files.exporters import format_of, frames_of_pack
 from gmem_jax.files.importers import load_spheres
 from gmem_jax.files.loads import frame_wall_forces, pressure_tensor
 from gmem_jax.physics import grain
+from gmem_jax.physics.pairs import sphere_places
 from gmem_jax.preparation import imported
-from gmem_jax.simulation.frames import Frames, sphere_places
+from gmem_jax.simulation.frames import Frames
 
 SOURCE = TETRA_27
 PACK = gm.load_pack(SOURCE)

@@ -130,7 +130,10 @@ def test_at_rest_walls_and_virial_say_one_stress(source: Path) -> None:
 
 
 @pytest.mark.skipif(not native.available()[0], reason="the library was not built")
-@pytest.mark.parametrize("source", [PERIODIC_27, PERIODIC_XY_27], ids=["periodic", "both"])
+@pytest.mark.parametrize(
+    "source",
+    [pytest.param(PERIODIC_27, id="periodic"), pytest.param(PERIODIC_XY_27, id="both", marks=pytest.mark.slow)],
+)
 def test_a_recall_is_the_same_on_either_backend(source: Path) -> None:
     pack = gm.load_pack(source)
     found, expected = (

@@ -1,6 +1,9 @@
 """Result files say what they hold: units, names and axes on every array. Old ones are still read."""
 
 import json
+import runpy
+from collections import OrderedDict
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -15,6 +18,8 @@ from gmem_jax.files import schemas
 from gmem_jax.files.results import load_result, save_result
 from gmem_jax.files.seal import seal
 from gmem_jax.files.waveforms import load_design, load_target, save_waveforms
+from gmem_jax.show.stages import QUANTITIES, stages_figure
+from gmem_jax.simulation.stage import BINS
 
 PACK = TETRA_27
 
@@ -53,6 +58,31 @@ def test_every_array_has_units_a_description_and_a_scale_for_each_dimension(file
                 assert 3 < len(array.attrs["description"]) < 90, array.name
                 for dimension, length in zip(array.dims, array.shape, strict=True):
                     assert array.is_scale or dimension[0].shape == (length,), array.name
+
+
+def test_times_count_stages_that_were_not_recorded(
+    stored: Path, recalled: tuple[gm.Experiment, gm.Recall], tmp_path: Path
+) -> None:
+    whole, left_out = recalled[1], "hold"
+    stages = OrderedDict((name, sample) for name, sample in whole.stages.items() if name != left_out)
+    protocol = gm.Protocol([replace(stage, recorded=stage.name != left_out) for stage in whole.protocol])
+    recall = replace(whole, stages=stages, protocol=protocol)
+    gm.save_recall(tmp_path / "some.h5", recall)
+    with h5py.File(stored) as file, h5py.File(tmp_path / "some.h5") as some:
+        assert left_out not in some["stages"]
+        for name in stages:
+            np.testing.assert_array_equal(some[f"stages/{name}/time"], file[f"stages/{name}/time"])
+        last = some["stages/readout/time"][-1]
+    assert last == sum(stage.bins for stage in protocol if stage.name != "readout-2") / BINS
+    pytest.importorskip("xarray")
+    for one in (recall, gm.load_recall(tmp_path / "some.h5")):
+        table = gm.to_xarray(one)
+        assert float(table.time[table.stage == "readout"][-1]) == last
+        (panel,) = stages_figure(one.stages, QUANTITIES["phi"], "", begins=one.protocol.begins, t0=2.0).panels
+        spans = {name: span for *span, name in panel.spans}
+        np.testing.assert_allclose(spans["readout"][1], 2.0 * last)
+        left = 2.0 * protocol.stage(left_out).bins / BINS
+        np.testing.assert_allclose(spans["decompress"][0], spans["compress"][1] + left)
 
 
 def test_xarray_opens_the_files_without_us(files: list[Path], recalled: tuple[gm.Experiment, gm.Recall]) -> None:
@@ -160,4 +190,5 @@ def test_a_designed_file_says_how_its_design_went(tmp_path: Path) -> None:
 
 def test_the_page_of_the_files_is_that_of_the_tables() -> None:
     page = ROOT / "docs" / "files.md"
-    assert page.read_text() == schemas.schema_page(), "python docs/make/files_page.py"
+    made = runpy.run_path(str(ROOT / "docs" / "make" / "files_page.py"))["page"]()
+    assert page.read_text() == made, "python docs/make/files_page.py"

@@ -84,20 +84,16 @@ def thrown(
     system = replace(system, clump=replace(system.clump, mass=system.clump.mass * spread))
     numbers = 0.3 * spread, 0.01 * (1.0 - spread)
     call, fixed, cell = call_of(system, periodic), fixed_of(system), state.cell
-    fields, history = jax.tree.leaves(grains), jax.tree.leaves((state.history, state.wall_history))
+    histories = state.history, state.wall_history
+    fields, history = jax.tree.leaves(grains), jax.tree.leaves(histories)
     for begun in range(0, ago + 1, 10):
         boxes = walls(begun, lower, upper, speed, periodic)
-        arrays = arrays_of(system, grains, state.history, boxes, numbers, cell, state.wall_history)
+        arrays = arrays_of(system, grains, histories, boxes, numbers, cell)
         arrays = arrays._replace(fields=fields, history=history)
         if begun < ago:
             fields, _, history = emulate(call, fixed, arrays)
             cell = jax.tree.map(lambda leaf: leaf[-1], boxes) if any(periodic) else None
-    return (
-        call,
-        fixed,
-        arrays,
-        PlainDefinition.of(system, state.history, periodic=periodic, wall_history=state.wall_history),
-    )
+    return call, fixed, arrays, PlainDefinition.of(system, histories, periodic=periodic)
 
 
 @functools.cache

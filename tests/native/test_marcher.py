@@ -129,13 +129,13 @@ def test_the_definition_of_a_call_is_what_the_library_computes(law: Any, isotrop
     call, fixed, definition = (
         call_of(system),
         fixed_of(system),
-        PlainDefinition.of(system, history),
+        PlainDefinition.of(system, (history, None)),
     )
 
     def arrays(speed: jax.Array) -> Arrays:
         numbers = jnp.asarray(0.3), jnp.asarray(0.01)
         grains = replace(STATE.grains, spin=speed + STATE.grains.spin)
-        return arrays_of(system, grains, history, squeeze(RATES * (1.0 + speed)), numbers)
+        return arrays_of(system, grains, (history, None), squeeze(RATES * (1.0 + speed)), numbers)
 
     def both(use: Callable[[Arrays], StepOutput]) -> Any:
         def value(speed: jax.Array) -> Any:
@@ -155,11 +155,13 @@ def test_other_platforms_have_the_derivatives_of_a_sweep() -> None:
     """Their rules, run here: on shared arguments, with leading axes of size one."""
     system, law = SYSTEM, SYSTEM.friction
     call, fixed = call_of(system), fixed_of(system)
-    definition = PlainDefinition.of(system, STATE.history)
+    definition = PlainDefinition.of(system, (STATE.history, None))
 
     def arrays(mu: jax.Array, rates: jax.Array) -> Arrays:
         chosen = replace(system, friction=replace(law, mu=mu))
-        return arrays_of(chosen, STATE.grains, STATE.history, squeeze(rates), (jnp.asarray(0.3), jnp.asarray(0.0)))
+        return arrays_of(
+            chosen, STATE.grains, (STATE.history, None), squeeze(rates), (jnp.asarray(0.3), jnp.asarray(0.0))
+        )
 
     def outer(tree: Any) -> Any:
         return jax.tree.map(lambda leaf: leaf[None], tree)

@@ -110,7 +110,7 @@ def parts_of(name: str) -> Parts:
     history = system.friction.init(pack.pairs.capacity, REPLICAS, np.dtype(float))
     numbers = jnp.asarray(0.3), jnp.asarray(0.01)
     at_walls = wall_histories(system, REPLICAS, pack.grains)
-    arrays = jax.tree.map(jnp.asarray, arrays_of(system, grains, history, box, numbers, state.cell, at_walls))
+    arrays = jax.tree.map(jnp.asarray, arrays_of(system, grains, (history, at_walls), box, numbers, state.cell))
     along = jax.tree.map(lambda leaf: jnp.asarray(draws.normal(size=leaf.shape)), arrays)
     return call_of(system, pack.box.periodic), fixed_of(system), arrays, along
 

@@ -35,7 +35,7 @@ def arguments(law: Any) -> Arguments:
     boxes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (2, 3, 2)), PACK.box)
     numbers = (jnp.asarray(0.3), jnp.asarray(0.0))
     fixed = fixed_of(system)
-    arrays = arrays_of(system, state.grains, state.history, boxes, numbers)
+    arrays = arrays_of(system, state.grains, (state.history, None), boxes, numbers)
     return {"call": call_of(system), **fixed._asdict(), **arrays._asdict()}
 
 

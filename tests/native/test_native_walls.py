@@ -87,8 +87,8 @@ def test_walls_of_this_scene_are_stuck_to_and_slid_on() -> None:
     system, _, boxes = scene = thrown("M1", 5)
     grains, _, history, *_ = moved(native.march, *scene)
     table, _ = forces.sphere_table(system.clump, grains)
-    box, solid = part(boxes, -1), (system.material.wall_stiffness, system.material.normal_damping)  # type: ignore[arg-type]
-    normal = wall_forces(table[:, :3], table[:, 3:6], box, *solid)
+    box, material = part(boxes, -1), system.material
+    normal = wall_forces(table, box, material, material.normal_damping)  # type: ignore[arg-type]
     _, force, _, _ = forces.wall_loads(system, grains, box, *normal, history, jnp.asarray(0.3))
     limit = np.asarray(system.wall_mu) * np.asarray(jnp.concatenate(normal, axis=1)).reshape(force.shape[0], 5)
     used = np.linalg.norm(force, axis=1)[limit > 0.0] / limit[limit > 0.0]

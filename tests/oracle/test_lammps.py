@@ -451,9 +451,8 @@ def test_forces_in_a_bidisperse_pack_between_walls_are_those_of_lammps(tmp_path)
     pack = gm.pack_from(replace(pack, clump=made), position=pack.position, quaternion=pack.quaternion)
     system, grains = dynamics.System(made, HOOKE, pack.pairs), scenes.make_grains(pack.position, pack.quaternion)
     ours, theirs = forces_in_a_cell(system, grains, pack.box, tmp_path)
-    radii, still = made.sphere_radii(len(ours)), jnp.zeros((len(ours), 3, 1))
-    places = forces.sphere_table(made, grains)[0][:, :3]
-    lower, upper = wall_forces(places, still, pack.box, MATERIAL.wall_stiffness, MATERIAL.normal_damping, radii)
+    table = forces.sphere_table(made, grains)[0] * jnp.asarray([1.0] * 3 + [0.0] * 6)[:, None]  # places at rest
+    lower, upper = wall_forces(table, pack.box, MATERIAL, MATERIAL.normal_damping, made.sphere_radii(len(ours)))
     by_walls = np.asarray(lower - upper)[..., 0]
     assert min(np.abs(ours).max(), np.abs(by_walls).max()) > 1e-3
     np.testing.assert_allclose(ours + by_walls, theirs, rtol=0.0, atol=1e-10 * np.abs(ours).max())

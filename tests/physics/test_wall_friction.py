@@ -48,8 +48,8 @@ LAWS = {
 def dragging(system: System, grains: Any, history: Any) -> Any:
     """Force, torque, new history and normal force of a sphere on the floor after a step of 1 t_c."""
     table, _ = forces.sphere_table(system.clump, grains)
-    solid, radii = (system.material.wall_stiffness, system.material.normal_damping), system.clump.sphere_radii(1)
-    lower, upper = wall_forces(table[:, :3], table[:, 3:6], FLOOR, *solid, radii)
+    material, radii = system.material, system.clump.sphere_radii(1)
+    lower, upper = wall_forces(table, FLOOR, material, material.normal_damping, radii)
     loads = forces.wall_loads(system, grains, FLOOR, lower, upper, history, jnp.asarray(1.0))
     return (*(jnp.sum(load, axis=0)[:, 0] for load in loads[1:3]), loads[3], jnp.sum(lower))
 
@@ -160,7 +160,7 @@ def test_friction_of_walls_takes_the_energy_that_its_forces_do() -> None:
 
     def stiffness(grains: Any) -> Any:
         table, _ = forces.sphere_table(system.clump, grains)
-        return table, wall_forces(table[:, :3], table[:, 3:6], FLOOR, ELASTIC.wall_stiffness, 0.0)
+        return table, wall_forces(table, FLOOR, ELASTIC, 0.0)
 
     def one(state: State, _: Any) -> Any:
         state, _ = dynamics.step(system, state, FLOOR, jnp.asarray(dt), 0.0, state.status[0] >= 0)

@@ -29,9 +29,10 @@ from gmem_jax.reproduce.compare import (
     read_csv,
     write_csv,
 )
+from gmem_jax.reproduce.cost import spec_for
 from gmem_jax.reproduce.dataset import COLLECTED
 from gmem_jax.reproduce.draw import power
-from gmem_jax.reproduce.figures import FIGURES, SCALES, PaperFigure, figure_spec, packs, scale_of
+from gmem_jax.reproduce.figures import FIGURES, SCALES, PaperFigure, packs, scale_of
 from gmem_jax.reproduce.run import Reproduction
 from gmem_jax.show.numbers import published
 from gmem_jax.sweeps.executors import Executor
@@ -96,7 +97,7 @@ def test_a_scale_with_changes() -> None:
         "poster": "no scale 'poster'; there are laptop, workstation, paper",
         "laptop,t=5": "a scale has no field to set by 't=5'",
         "laptop,packs=1.5": "must be like packs=5",
-        "laptop,lengths=3,4": "'4' changes nothing",
+        "laptop,lengths=3,4": "no field to set by '4'",
         "laptop,lengths=": r"must be like lengths=3\+4\+5",
         "laptop,t0=-1": "must be positive",
         "laptop,t0=nan": "must be positive",
@@ -154,7 +155,7 @@ def test_the_exponent_of_a_power_law() -> None:
 @pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize("name", FIGURES)
 def test_every_figure_has_points_that_a_sweep_takes_and_none_twice(name: str, scale: str) -> None:
-    points = figure_spec(FIGURES[name], SCALES[scale]).extra
+    points = spec_for(name, scale).extra
     for values in points:
         require_kinds(values)
     rows = [tuple(sorted(values.items())) for values in points]

@@ -172,8 +172,8 @@ def test_a_file_gives_frames_back(filmed: gm.Recall, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "refusal"),
     [
-        ({"spheres": lambda a: a + 200}, "not between two of its grains"),
-        ({"start": lambda a: a[::-1]}, "one after the other"),
+        ({"spheres": lambda a: a + 200}, "must be between spheres of two of its grains"),
+        ({"start": lambda a: a[::-1]}, "must follow each other"),
         ({"time": lambda a: a[:-1]}, "has shape"),
         ({"quaternion": lambda a: 2.0 * a}, "not of length 1"),
         ({"normal_force": lambda a: a * np.nan}, "not finite"),

@@ -18,14 +18,13 @@ from gmem_jax.experiment.record import describe
 from gmem_jax.physics.census import overlaps
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.material import Material
-from gmem_jax.physics.pairs import listed_candidates
+from gmem_jax.physics.pairs import listed_candidates, sphere_places
 from gmem_jax.physics.pytree import pytree
 from gmem_jax.physics.rotation import matrix
 from gmem_jax.physics.state import Box, State, still_box
 from gmem_jax.physics.system import System
 from gmem_jax.show.recalls import recall_figure
 from gmem_jax.simulation import observables
-from gmem_jax.simulation.frames import sphere_places
 from gmem_jax.simulation.loop import Mark, Simulation
 from gmem_jax.simulation.observables import Observable
 from gmem_jax.simulation.sample import end_bin
@@ -460,7 +459,7 @@ def test_what_cannot_be_seen_is_refused() -> None:
         observables.sliding()(replace(simulation, system=replace(system, friction=NoMu())), state)
     with pytest.raises(ValueError, match="at the end of a bin"):
         observables.nonaffine()(replace(simulation, mark=None), state)
-    with pytest.raises(ValueError, match="lines of up to 200 letters"):
+    with pytest.raises(ValueError, match="one line of at most 200 letters"):
         observables.Observable("a\nb", "1", "", counted)
 
 

@@ -10,10 +10,8 @@ import pytest
 from scenes import TETRA_27
 
 import gmem_jax as gm
-from gmem_jax.experiment.recall import finish
-from gmem_jax.physics.pairs import sphere_centres
 from gmem_jax.physics.search import PairFinder
-from gmem_jax.physics.state import State, Status, combined_status, replicate
+from gmem_jax.physics.state import State, Status, combined_status
 from gmem_jax.physics.step import start
 from gmem_jax.physics.system import System
 from gmem_jax.simulation import stability
@@ -21,7 +19,7 @@ from gmem_jax.simulation.loop import Simulation
 from gmem_jax.simulation.observers import Chunk, Observer
 from gmem_jax.simulation.progress import work_of
 from gmem_jax.simulation.runner import Runner
-from gmem_jax.simulation.sample import Sample, end_bin
+from gmem_jax.simulation.sample import Sample
 from gmem_jax.simulation.stage import Stage
 from gmem_jax.simulation.strain import StrainPath
 
@@ -230,49 +228,3 @@ def test_only_while_the_walls_stand_still_is_there_a_drag() -> None:
     free, damped = pressures(0.0), pressures(0.01)
     np.testing.assert_array_equal(damped["compress"], free["compress"])
     assert np.abs(damped["hold"] - free["hold"]).max() > 1e-3 * np.abs(free["hold"]).max()
-
-
-def test_a_pack_is_at_rest_below_one_percent_of_the_speed_of_its_walls() -> None:
-    experiment = gm.Experiment(PACK, gm.six_signals(), t0=75.0, rest=0.02, hold=0.02, store=0.02)
-    found = gm.run(experiment)
-    store = found.stages["store"]
-    # The speed of one wall of the x axis, by the paper's u: half the edge, less the part that compression leaves.
-    walls = 0.5 * float(PACK.upper[0] - PACK.lower[0]) * (1.0 - np.sqrt(0.95)) / 75.0
-
-    def at(part: float) -> gm.Recall:
-        """With the last of the storage's speeds, and no other, at this part of the walls' speed; replica 0's half."""
-        speeds = np.full(store.largest_speed.shape, 2.0 * walls)
-        speeds[:-1, 1] = speeds[:-1, 2] = 0.0
-        speeds[-1] = part * walls
-        speeds[-1, 0] *= 0.5
-        stages = found.stages | {"store": replace(store, largest_speed=speeds)}
-        return finish(experiment, stages, jnp.zeros(7, jnp.int32))
-
-    below, above = at(0.01 * (1.0 - 1e-9)), at(0.01 * (1.0 + 1e-9))
-    unrest = int(Status.NOT_AT_REST)  # the drive is too fast as well, which is another bit
-    np.testing.assert_array_equal(below.status & unrest, 0)
-    np.testing.assert_array_equal(above.status & unrest, [0] + [unrest] * 6)
-    np.testing.assert_allclose(above.residual_speed, [0.005] + [0.01] * 6, rtol=1e-8)
-    # A warning, no more: the numbers stand.
-    np.testing.assert_array_equal(above.p_sig, found.p_sig)
-
-
-def test_an_overlap_beyond_the_law_is_flagged_in_its_replica_and_no_other() -> None:
-    still = replicate(start(System(PACK.clump, gm.Hooke(), PACK.pairs), AT, TURNED, PACK.box), 2)
-    spheres = np.asarray(sphere_centres(still.grains, PACK.clump))[..., 0].reshape(PACK.grains, -1, 3)
-    distances = np.linalg.norm(spheres[:, None, :, None] - spheres[None, :, None, :], axis=-1)
-    distances[np.arange(PACK.grains), np.arange(PACK.grains)] = np.inf  # spheres of one grain may overlap
-    overlap = 2.0 - distances.min()
-
-    def flagged(law: object) -> list[int]:
-        state, sample = end_bin(System(PACK.clump, law, PACK.pairs), still, PACK.box, jnp.zeros((3, 2)), 0.0)
-        np.testing.assert_allclose(sample.largest_overlap, overlap, rtol=1e-12)
-        return np.asarray(state.status).tolist()
-
-    beyond = int(Status.OVERLAP_RANGE)
-    assert overlap > 1e-3
-    assert flagged(gm.Mindlin(p_max=overlap * (1.0 + 1e-9))) == [0, 0]
-    assert flagged(gm.Mindlin(p_max=overlap * (1.0 - 1e-9))) == [beyond, beyond]
-    assert flagged(gm.Mindlin(p_max=overlap * jnp.asarray([1.0 - 1e-9, 1.0 + 1e-9]))) == [beyond, 0]
-    assert flagged(gm.Hooke()) == [0, 0]
-    assert Status.OVERLAP_RANGE.fatal

@@ -18,20 +18,14 @@ PLANES = 6  # of a box: a sphere's contacts with them are the lower planes of x,
 
 
 def wall_forces(
-    position: jax.Array,
-    velocity: jax.Array,
-    box: Box,
-    stiffness: Scalar,
-    damping_time: Scalar,
-    radii: jax.Array | None = None,
+    table: jax.Array, box: Box, material: Material, damping_time: Scalar, radii: jax.Array | None = None
 ) -> tuple[jax.Array, jax.Array]:
     """Damped Hertz contact of spheres with the planes; damping acts on the velocity relative to the plane.
 
     Args:
-        position: sphere centres, [S, 3, B].
-        velocity: sphere-centre velocities, [S, 3, B].
+        table: centres and velocities of the spheres, and more, [S, 6 or more, B].
         box: the planes.
-        stiffness: k_w of a sphere of radius 1, in E R^0.5.
+        material: the elastic solid.
         damping_time: gamma_w / k_w, in t_c.
         radii: radii of the spheres, [S], in R; None where all are 1.
 
@@ -39,6 +33,7 @@ def wall_forces(
         The forces from the lower and from the upper planes (both as magnitudes >= 0), each [S, 3, B]; 0 along periodic
         axes, which have no walls.
     """
+    position, velocity, stiffness = table[:, :3], table[:, 3:6], material.wall_stiffness
     wide = None if radii is None else radii[:, None, None]
     reach = 1.0 if wide is None else wide
     lower = reach - (position - box.lower)
