@@ -146,8 +146,7 @@ SHORT = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("backend", ["native", "jax"])
-@pytest.mark.parametrize("name", SHORT)
+@pytest.mark.parametrize(("name", "backend"), [*((name, "native") for name in SHORT), ("amplitude_training", "jax")])
 def test_gradients_through_the_shelf_are_central_differences(name: str, backend: str) -> None:
     one = experiment(SHORT[name](), SETS.get(name, ONE), backend=backend)
 

@@ -2,6 +2,7 @@
 
 import errno
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -81,7 +82,26 @@ def test_gsd_reads_what_was_written(run_frames: Frames, tmp_path: Path) -> None:
             np.testing.assert_array_equal(frame.bonds.group, run_frames.spheres[own])
             np.testing.assert_array_equal(frame.log["bonds/normal_force"], run_frames.normal_force[own])
             np.testing.assert_array_equal(frame.log["bonds/friction_force"], run_frames.friction_force[own])
-            assert frame.log["particles/wall_force"].shape == (108, 3)
+            assert frame.log["u"] == run_frames.u[number]
+            turned = np.repeat(run_frames.quaternion[number], 4, axis=0)
+            np.testing.assert_allclose(frame.particles.orientation, turned, atol=SINGLE)
+            walls = frame_wall_forces(run_frames, number, SOLID).sum(axis=1)
+            assert np.abs(walls).max() > 0.0
+            np.testing.assert_array_equal(frame.log["particles/wall_force"], walls)
+
+
+def test_the_frames_of_a_recall_are_exported_with_its_own_material(
+    monkeypatch: pytest.MonkeyPatch, recalled: tuple[gm.Experiment, gm.Recall], run_frames: Frames, tmp_path: Path
+) -> None:
+    hoomd = pytest.importorskip("gsd.hoomd")
+    soft = gm.replace(recalled[0], material=gm.Material(wall_rigidity=0.5))
+    gm.save_recall(tmp_path / "a.h5", replace(recalled[1], frames=run_frames).described(gm.describe(soft)))
+    assert gmem(monkeypatch, "export", tmp_path / "a.h5", "--to", "gsd", "-o", tmp_path / "a.gsd") == 0
+    with hoomd.open(tmp_path / "a.gsd", "r") as file:
+        assert len(file) == 2
+        walls = frame_wall_forces(run_frames, 1, soft.material).sum(axis=1)
+        np.testing.assert_array_equal(file[1].log["particles/wall_force"], walls)
+        np.testing.assert_allclose(np.sum(file[1].particles.mass), MASS * PACK.grains, rtol=1e-6)
 
 
 def without_contacts(frames: Frames) -> Frames:
@@ -204,6 +224,11 @@ def test_extended_xyz_has_a_line_for_every_sphere(run_frames: Frames, tmp_path: 
     assert lines[0] == lines[count + 2] == str(count)
     assert 'Properties="species:S:1:pos:R:3:radius:R:1:molecule:I:1"' in lines[count + 3]
     assert 'stage="encode"' in lines[count + 3]
+    said = dict(re.findall(r'(\w+)="([^"]*)"', lines[count + 3]))
+    numbers = {name: np.fromstring(said[name], sep=" ") for name in ("Lattice", "Origin", "Time", "u")}
+    np.testing.assert_array_equal(numbers["Lattice"].reshape(3, 3), np.diag((run_frames.upper - run_frames.lower)[1]))
+    np.testing.assert_array_equal(numbers["Origin"], run_frames.lower[1])
+    assert (numbers["Time"], numbers["u"]) == (41.5, run_frames.u[1])
     table = np.loadtxt(lines[count + 4 :], usecols=range(1, 6))
     np.testing.assert_array_equal(table[:, :3], run_frames.centres(1))
     np.testing.assert_array_equal(table[:, 3], 1.0)
@@ -241,6 +266,21 @@ def test_a_pack_comes_back(pack_frames: Frames, tmp_path: Path, name: str, withi
     np.testing.assert_allclose(back.lower, PACK.lower, atol=within)
     gm.save_pack(tmp_path / "back.h5", back)
     assert gm.load_pack(tmp_path / "back.h5").grains == PACK.grains
+
+
+@pytest.mark.usefixtures("quick")
+def test_the_last_frame_of_a_gsd_file_is_taken(pack_frames: Frames, tmp_path: Path) -> None:
+    pytest.importorskip("gsd.hoomd")
+    one, count = pack_frames, len(pack_frames.spheres)
+    of_contacts = ("spheres", "normal_force", "friction_force")
+    same = ("u", "time", "quaternion", "lower", "upper", *of_contacts)
+    twice = {name: np.concatenate([getattr(one, name)] * 2) for name in same}
+    before = one.position + np.array([0.02, 0.0, 0.0])
+    places = np.concatenate([before, one.position])
+    start = np.array([0, count, 2 * count])
+    frames = replace(one, **twice, position=places, start=start, stages=("before", "after"))
+    back = imported.import_pack(written(tmp_path, "gsd", frames))
+    np.testing.assert_allclose(back.position, PACK.position, atol=SINGLE)
 
 
 def test_grains_of_any_shape_are_found_in_any_order_of_their_spheres() -> None:
@@ -350,6 +390,9 @@ def test_the_commands_there_and_back(
     assert gmem(monkeypatch, "import", data, "-o", pack, "--json") == 0
     told = json.loads(capsys.readouterr().out)
     assert (told["grain"], told["notes"]) == ("tetra(0.6)", [])
+    assert gmem(monkeypatch, "import", data, "-o", tmp_path / "mine.h5", "--delta0", 0.04, "--name", "mine") == 0
+    mine = gm.load_pack(tmp_path / "mine.h5")
+    assert (mine.name, float(mine.delta0)) == ("mine", 0.04)
     for file, words in ((SOURCE, "cycled with delta0"), (pack, "meant for delta0")):
         assert gmem(monkeypatch, "show", file) == 0
         assert words in capsys.readouterr().out
