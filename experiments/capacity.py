@@ -22,8 +22,8 @@ from rows import done, note
 import gmem_jax as gm
 from gmem_jax.design.by_kernel import KERNEL_BUMP_WIDTH, KERNEL_BUMPS
 from gmem_jax.design.kernel import bumps
+from gmem_jax.experiment.cost import LARGEST_BATCH
 from gmem_jax.experiment.record import key_of_run
-from gmem_jax.experiment.run import LARGEST_BATCH
 from gmem_jax.files.checkpoints import Checkpoints
 from gmem_jax.physics.material import Material
 from gmem_jax.reading.capacity import candidates, channels, decoded_bits, greedy_alphabet, smallest_distance

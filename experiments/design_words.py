@@ -25,8 +25,8 @@ from rows import done, note
 
 import gmem_jax as gm
 from gmem_jax.design.by_kernel import KERNEL_BUMP_WIDTH, KERNEL_BUMPS
+from gmem_jax.experiment.cost import LARGEST_BATCH
 from gmem_jax.experiment.record import key_of_run
-from gmem_jax.experiment.run import LARGEST_BATCH
 from gmem_jax.experiment.signals import bin_average
 from gmem_jax.files.checkpoints import Checkpoints
 from gmem_jax.reading import training

@@ -2217,7 +2217,7 @@ MUTATIONS = (
     ),
     mutation(
         "material-of-the-pack",
-        "experiment/run.py",
+        "experiment/pack_warnings.py",
         '_ELASTIC = ("poisson", "normal_damping", "wall_rigidity")',
         '_ELASTIC = ("poisson", "normal_damping")',
         "test_another_material_than_the_packs_own_warns",

@@ -36,10 +36,11 @@ from gmem_jax.design.drive import PARAMETERS, design_drive, start_within
 from gmem_jax.design.kernel import memory_kernel, relative_error
 from gmem_jax.design.stored import save_kernel
 from gmem_jax.experiment.changes import value_at
+from gmem_jax.experiment.cost import COPIES, run_bytes, steps_of_grains
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.identity import fingerprint
 from gmem_jax.experiment.record import describe, key_of_run, pack_fingerprint
-from gmem_jax.experiment.run import COPIES, prefix_of, run, run_bytes, steps_of_grains
+from gmem_jax.experiment.run import prefix_of, run
 from gmem_jax.experiment.signals import Bumps, Spline, waveform
 from gmem_jax.files import schemas
 from gmem_jax.files.results import save_result

@@ -30,9 +30,10 @@ from gmem_jax.command.console import (
 from gmem_jax.command.options import ExperimentOptions, with_experiment
 from gmem_jax.command.resuming import Restart, batch_for, foresee, resumable
 from gmem_jax.experiment.analysis import spread
+from gmem_jax.experiment.cost import run_bytes, steps_of_grains
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.record import key_of_run, signals_to_dict
-from gmem_jax.experiment.run import frame_schedule, run, run_bytes, steps_of_grains
+from gmem_jax.experiment.run import frame_schedule, run
 from gmem_jax.experiment.signals import Signals, six_signals
 from gmem_jax.experiment.stepping import at_accuracy, require_stable, stable_step
 from gmem_jax.files.cache import list_packs

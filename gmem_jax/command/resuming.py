@@ -10,8 +10,8 @@ import psutil
 import typer
 
 from gmem_jax.command.console import BEGINS_ANEW, InputError, RunInterruptedError, log
+from gmem_jax.experiment.cost import default_batch
 from gmem_jax.experiment.experiment import Experiment
-from gmem_jax.experiment.run import default_batch
 from gmem_jax.files.atomic import probe
 from gmem_jax.files.checkpoints import Checkpoints, lock_of, locked
 from gmem_jax.files.ours import remove_leftovers

@@ -1,4 +1,4 @@
-"""Running an experiment on the host: the prefix once, then batches of waveforms in chunks; the memory it needs."""
+"""Running an experiment on the host: the prefix once, then batches of waveforms in chunks."""
 
 import dataclasses
 import time
@@ -10,16 +10,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax.errors import warn_caller
 from gmem_jax.experiment.arguments import require_kind, require_several
 from gmem_jax.experiment.asked import require_double, require_host, require_inside
 from gmem_jax.experiment.changes import with_part
 from gmem_jax.experiment.experiment import Experiment, replica_parameters
 from gmem_jax.experiment.identity import identity
+from gmem_jax.experiment.pack_warnings import warn_of_another_preparation
 from gmem_jax.experiment.recall import Recall, judged, unjudged, with_waveforms
 from gmem_jax.experiment.record import describe
 from gmem_jax.experiment.stepping import require_stable
-from gmem_jax.physics.numbers import is_real, require_whole, said
+from gmem_jax.physics.numbers import require_whole
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache, no_cache
 from gmem_jax.simulation.compiled import Compiled, require_x64
@@ -31,11 +31,7 @@ from gmem_jax.simulation.sample import Sample
 from gmem_jax.simulation.sharding import placement_of
 from gmem_jax.simulation.strain import smallest_box
 
-COPIES = 4  # copies of a replica's arrays at one time: arguments, results and scratch of a call, and one to spare
-GRAIN_BYTES = 800  # bytes for the numbers of a grain and of its spheres
-_ELASTIC = ("poisson", "normal_damping", "wall_rigidity")  # fields of a `Material` that are not units
 PREFIX = "prefix"  # name of the part of a run that is common to all waveforms
-LARGEST_BATCH = 63  # signals; with the zero signal they fill whole vectors on every CPU
 
 _begin = Compiled(Experiment.begin, quick=True)
 _fan_out = Compiled(Experiment.fan_out)
@@ -235,90 +231,6 @@ def frame_schedule(experiment: Experiment, frames: int, of: int, at: Sequence[fl
     return FrameSchedule({name: found for name, found in both.items() if found}, of)
 
 
-def replica_bins(experiment: Experiment, batch: int) -> int:
-    """Bins times replicas of a run: the prefix has one replica, and each batch one more than signals."""
-    before, after = (sum(stage.bins for stage in some) for some in experiment.phases)
-    count = experiment.signals.count
-    return before + after * (count + -(-count // batch))
-
-
-def steps_of_grains(experiment: Experiment, batch: int) -> int:
-    """Steps of a run times grains times replicas."""
-    return experiment.pack.grains * experiment.timing.steps * replica_bins(experiment, batch)
-
-
 def _join(first: Any, *others: Any) -> np.ndarray:
     """Join the replicas of several batches along the last axis; the zero signal of the first batch stands for all."""
     return np.concatenate([np.asarray(first), *(np.asarray(other)[..., 1:] for other in others)], axis=-1)
-
-
-class OtherGravityWarning(UserWarning):
-    """A pack was prepared under gravity, and the experiment has no gravity or a different one."""
-
-
-class OtherCompressionWarning(UserWarning):
-    """A pack was cycled with another delta0: a warning of `Status.OTHER_COMPRESSION` before the run."""
-
-
-def warn_of_another_preparation(experiment: Experiment) -> None:
-    """Warn if a pack was prepared with another delta0, other elastic constants, or another gravity."""
-    warn_of_another_compression(experiment)
-    _warn_of_another_material(experiment)
-    if weight := other_weight(experiment):
-        warn_caller(weight, OtherGravityWarning)
-
-
-def warn_of_another_compression(experiment: Experiment) -> None:
-    """Warn of a delta0 other than that with which the pack was cycled."""
-    own = float(experiment.pack.delta0)
-    if not np.allclose(np.asarray(experiment.compression), own):
-        warn_caller(
-            f"{experiment.pack.name} was cycled with delta0 = {own:g}, not {experiment.delta0}: its memory of the "
-            "preparation differs from the paper's; prepare a pack for this delta0",
-            OtherCompressionWarning,
-        )
-
-
-def _warn_of_another_material(experiment: Experiment) -> None:
-    """Warn of elastic constants other than those with which the pack came to rest; units are left out."""
-    pack, recorded = experiment.pack, experiment.pack.info.get("material", {})
-    made = {name: recorded[name] for name in _ELASTIC if is_real(recorded.get(name, ""))}
-    if odd := [name for name in made if not np.allclose(np.asarray(getattr(experiment.material, name)), made[name])]:
-        others = ", ".join(f"{name} = {made[name]:g}, not {said(getattr(experiment.material, name))}" for name in odd)
-        warn_caller(
-            f"{pack.name} was prepared with {others}: it is not at rest with the new values; use those of its "
-            "preparation, as in material=gm.Material(...), or prepare a pack with the new ones"
-        )
-
-
-def other_weight(experiment: Experiment) -> str:
-    """The warning if a pack was prepared under another gravity than the experiment's; "" if not.
-
-    A pack that was prepared without gravity sags a little under it, which an experiment may want: no warning.
-    """
-    pack, gravity = experiment.pack, 0.0 if experiment.gravity is None else experiment.gravity
-    own = (pack.info.get("recipe") or {}).get("gravity", 0.0)
-    if own <= 0.0 or np.allclose(np.asarray(gravity), own, atol=0.0):
-        return ""
-    return (
-        f"{pack.name} was prepared under gravity = {own:g}, not {said(gravity)}: it is not at rest with the new "
-        f"value; use gravity = {own:g}, or prepare a pack with the new one"
-    )
-
-
-def _replica_bytes(experiment: Experiment) -> int:
-    """Memory that a replica takes while it runs, in bytes."""
-    pairs = experiment.pack.pairs
-    history = jax.eval_shape(lambda: experiment.friction.init(pairs.capacity, 1, jnp.zeros(()).dtype))
-    contacts: int = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(history))
-    return COPIES * (contacts + GRAIN_BYTES * experiment.pack.grains)
-
-
-def run_bytes(experiment: Experiment, batch: int) -> int:
-    """Memory that a run of `batch` signals and the zero signal will take, in bytes."""
-    return (batch + 1) * _replica_bytes(experiment)
-
-
-def default_batch(experiment: Experiment, available: int) -> int:
-    """Number of signals that may run together in half of the `available` bytes; at most `LARGEST_BATCH`."""
-    return int(max(1, min(LARGEST_BATCH, 0.5 * available / _replica_bytes(experiment) - 1)))

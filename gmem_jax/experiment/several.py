@@ -17,9 +17,10 @@ import numpy as np
 from gmem_jax.experiment.changes import replace, value_at
 from gmem_jax.experiment.experiment import NOT_OF_PAPER, Experiment, acts_on_prefix, replica_parameters
 from gmem_jax.experiment.identity import identity
+from gmem_jax.experiment.pack_warnings import warn_of_another_preparation
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.record import describe
-from gmem_jax.experiment.run import PREFIX, finished, runner_of, warn_of_another_preparation
+from gmem_jax.experiment.run import PREFIX, finished, runner_of
 from gmem_jax.experiment.signals import ChosenSignals, Signals, SignalSets, bin_average
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache, no_cache

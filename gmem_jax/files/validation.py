@@ -19,7 +19,7 @@ from gmem_jax.physics.grain import require_radii
 from gmem_jax.physics.rules import require_started
 from gmem_jax.simulation.stage import BINS
 
-DTYPES = {"real": ("float32", "float64"), "whole": ("int32", "int64"), "yes or no": ("bool",), "text": ("bytes",)}
+DTYPES = {"real": ("float32", "float64"), "whole": ("int32", "int64"), "text": ("bytes",)}
 # Dimensions that have one length in every file.
 FIXED_LENGTHS = {"u": BINS, "axis": 3, "component": 4, "side": 2, "plane": 6}
 MOST_DIGITS = 18  # digits of a whole number: no count or seed has more
@@ -88,7 +88,7 @@ class Array(NamedTuple):
     """A declared array.
 
     Attributes:
-        kind: "real", "whole", "yes or no" or "text".
+        kind: "real", "whole" or "text".
         shape: lengths of its dimensions, or names; a name stands for the same length everywhere.
         units: units of its numbers.
         words: a description in one line.

@@ -8,9 +8,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from gmem_jax.experiment.cost import default_batch, steps_of_grains
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.record import key_of_run, to_dict
-from gmem_jax.experiment.run import default_batch, steps_of_grains
 from gmem_jax.experiment.several import match
 
 ABREAST = 64  # most replicas of a run: whole vectors on every CPU, and enough for every thread

@@ -17,12 +17,12 @@ import psutil
 from gmem_jax.errors import FileFormatError, RunFailedError
 from gmem_jax.experiment.arguments import require_kind, require_several
 from gmem_jax.experiment.changes import replace as with_values
+from gmem_jax.experiment.cost import replica_bins
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.html import listing
 from gmem_jax.experiment.identity import identity
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.recall import Recall
-from gmem_jax.experiment.run import replica_bins
 from gmem_jax.files.configuration import named_experiment, with_protocol
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.protocols import named_protocol

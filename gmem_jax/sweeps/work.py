@@ -25,8 +25,9 @@ import jax
 
 from gmem_jax.errors import FileFormatError, RunFailedError
 from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.experiment.pack_warnings import OtherCompressionWarning, OtherGravityWarning, other_weight
 from gmem_jax.experiment.recall import Recall
-from gmem_jax.experiment.run import OtherCompressionWarning, OtherGravityWarning, other_weight, run
+from gmem_jax.experiment.run import run
 from gmem_jax.experiment.several import run_several
 from gmem_jax.files.checkpoints import Checkpoints, part_with
 from gmem_jax.files.compilation_cache import keep_programs

@@ -14,7 +14,7 @@ from test_cli import PACK
 import gmem_jax as gm
 from gmem_jax.command.classify import _chosen
 from gmem_jax.experiment import analysis
-from gmem_jax.experiment.run import steps_of_grains
+from gmem_jax.experiment.cost import steps_of_grains
 from gmem_jax.files.sizes import recall_bytes
 from gmem_jax.reading.readers import stored_words
 from gmem_jax.show import tables

@@ -13,7 +13,8 @@ import pytest
 from scenes import TETRA_27
 
 import gmem_jax as gm
-from gmem_jax.experiment.run import COPIES, GRAIN_BYTES, apply_waveforms, default_batch, runner_of
+from gmem_jax.experiment.cost import COPIES, GRAIN_BYTES, default_batch
+from gmem_jax.experiment.run import apply_waveforms, runner_of
 from gmem_jax.files.checkpoints import Checkpoints
 from gmem_jax.simulation.checkpoints import no_cache
 from gmem_jax.simulation.observers import forward

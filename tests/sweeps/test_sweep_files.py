@@ -15,7 +15,7 @@ from scenes import TETRA_27
 
 import gmem_jax as gm
 from gmem_jax.experiment.changes import value_at
-from gmem_jax.experiment.run import OtherCompressionWarning, warn_of_another_compression
+from gmem_jax.experiment.pack_warnings import OtherCompressionWarning, warn_of_another_compression
 from gmem_jax.files.atomic import atomic
 from gmem_jax.show.numbers import status_words
 from gmem_jax.show.sweeps import points_table
