@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scenes
+from trajectory import run_lammps
 
 import gmem_jax as gm
 from gmem_jax.bench import lammps
@@ -120,7 +121,7 @@ def test_an_oblique_load_and_unload_agrees_to_round_off(law, mu, tmp_path):
     velocity = (f"{2 * shear}*v_rate*sin(2*v_a)", "0.0", f"-{depth}*v_rate*cos(v_a)")
     steps = 2000
     script = two_spheres(tmp_path, law, duration / steps, variables, displacement, velocity)
-    theirs = lammps.run_lammps(script, tmp_path, steps=steps, every=1, per_grain=1).force[1:, 0]
+    theirs = run_lammps(script, tmp_path, steps=steps, every=1, per_grain=1).force[1:, 0]
     ours = forces_on_a_path(law, path, lambda t: jnp.zeros(3), duration, steps)
     np.testing.assert_allclose(theirs, ours, rtol=0.0, atol=1e-12 * np.abs(ours).max())  # measured 3e-14
 
@@ -152,7 +153,7 @@ def test_a_tumbling_stuck_pair_carries_its_force_around(law, tmp_path):
     script = two_spheres(tmp_path, law, duration / steps, variables, displacement, velocity, start=(0.0, 0.0, distance))
     # The spin at which LAMMPS' surfaces, at the full radius, do not slide on each other.
     script += [f"run {steps}", f"set group all omega 0 {rate * (1.0 - 0.5 * overlap)!r} 0"]
-    theirs = lammps.run_lammps(script, tmp_path, steps=steps, every=steps, per_grain=1).force[-1, 0]
+    theirs = run_lammps(script, tmp_path, steps=steps, every=steps, per_grain=1).force[-1, 0]
     ours = forces_on_a_path(law, path, spin, 2.0 * duration, 2 * steps)[[steps - 1, -1]]
     scale = np.linalg.norm(ours[1])
     assert np.linalg.norm(ours[1] - ours[0]) > 0.5 * scale
@@ -223,7 +224,7 @@ class Comparison:
         more = {"gravity": system.gravity, "wall_mu": system.wall_mu}
         script = lammps.scene_script(scene, system.friction, MATERIAL, dt, folder, **more)
         per_grain = self.system.clump.spheres
-        run = lammps.run_lammps(script, folder, steps=steps, every=steps // frames, per_grain=per_grain)
+        run = run_lammps(script, folder, steps=steps, every=steps // frames, per_grain=per_grain)
         return run.position[1:], run.velocity[1:], run.spin[1:], np.abs(run.walls[1:])
 
 
@@ -395,7 +396,7 @@ def in_a_cell(system, grains, box, folder, dt, steps):
         at = (np.asarray(grains.position)[..., 0], quaternion, np.zeros((len(quaternion), 3)), 0.0 * quaternion[:, 1:])
     scene = lammps.Scene(system.clump, *at, *planes, periodic=box.periodic)
     script = lammps.scene_script(scene, system.friction, system.material, dt, folder)
-    return lammps.run_lammps(script, folder, steps=steps, every=steps, per_grain=system.clump.spheres)
+    return run_lammps(script, folder, steps=steps, every=steps, per_grain=system.clump.spheres)
 
 
 def forces_in_a_cell(system, grains, box, folder):
