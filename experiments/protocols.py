@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from console import in_one_line
-from packs import FIVE
+from packs import FIVE, called
 from rows import done, note
 
 import gmem_jax as gm
@@ -63,7 +63,7 @@ class Case:
     """A pack, and the shear-free prefixes that its runs have in common."""
 
     def __init__(self, name: str, t0: float) -> None:
-        self.name, self.t0, self.pack = name, t0, gm.load_pack(name)
+        self.name, self.t0, self.pack, self.status = name, t0, gm.load_pack(name), 0
         self._prefixes: dict[Any, Prefix] = {}
 
     def experiment(self, protocol: gm.Protocol, signals: Any = SIX, **more: Any) -> gm.Experiment:
@@ -76,7 +76,9 @@ class Case:
         begun = one.phases[0], one.observe
         if begun not in self._prefixes:
             self._prefixes[begun] = prefix_of(one)
-        return one, gm.run(one, prefix=self._prefixes[begun], progress=False)
+        recall = gm.run(one, prefix=self._prefixes[begun], progress=False)
+        self.status |= int(np.bitwise_or.reduce(np.ravel(recall.status)))
+        return one, recall
 
 
 def rms(values: Any) -> float:
@@ -340,7 +342,7 @@ def main() -> None:
     """Run the missing studies, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-o", "--output", type=Path, default=Path("protocols"), help="folder to write to")
-    parser.add_argument("--packs", default=FIVE)
+    parser.add_argument("--packs", type=called, default=FIVE)
     parser.add_argument("--studies", default=",".join(STUDIES))
     parser.add_argument("--t0", type=float, default=1.8e3)
     arguments = parser.parse_args()
@@ -350,17 +352,17 @@ def main() -> None:
     path = arguments.output / "protocols.csv"
     if other := {float(row["t0"]) for row in done(path)} - {arguments.t0}:
         parser.error(f"{path}: has studies of t0 = {min(other):g}; name another folder")
-    cases = {name: Case(name, arguments.t0) for name in filter(None, arguments.packs.split(","))}
+    cases = {name: Case(name, arguments.t0) for name in arguments.packs}
     for study in arguments.studies.split(","):
         for name, case in cases.items():
             if any(row["pack"] == name and row["study"] == study for row in done(path)):
                 continue
-            began = time.process_time()
+            began, case.status = time.process_time(), 0
             found = STUDIES[study](case)
             seconds = f"{time.process_time() - began:.0f}"
             own = {"pack": name, "N": case.pack.grains, "t0": arguments.t0, "study": study, "seconds": seconds}
             note(path, COLUMNS, [own | {"quantity": key, "value": f"{value:.5g}"} for key, value in found.items()])
-            print(f"{name} {study}: {seconds} CPU s", flush=True)
+            print(f"{name} {study}: {gm.explain(case.status)}, {seconds} CPU s", flush=True)
     print(*table(done(path)), sep="\n")
 
 

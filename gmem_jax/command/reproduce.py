@@ -13,14 +13,15 @@ from gmem_jax.command.console import AsJson, DryRun, InputError, log, print_resu
 from gmem_jax.command.resuming import check_folder
 from gmem_jax.errors import RunFailedError
 from gmem_jax.files.checkpoints import locked
-from gmem_jax.physics.state import combined_status
+from gmem_jax.physics.state import combined_status, explain
 from gmem_jax.reproduce import choices
 from gmem_jax.reproduce.choices import Effect
+from gmem_jax.reproduce.claims import UNTOLD
 from gmem_jax.reproduce.compare import Compared
 from gmem_jax.reproduce.cost import spec_for_all
 from gmem_jax.reproduce.dataset import COLLECTED
 from gmem_jax.reproduce.figures import FIGURES, GALLERY, SCALES, scale_of
-from gmem_jax.reproduce.run import RUNS, SCHEMATICS, Outcome, Reproduction, outcome_summary
+from gmem_jax.reproduce.run import RUNS, SCHEMATICS, Claims, Outcome, Reproduction, outcome_summary
 from gmem_jax.show.tables import decimal
 from gmem_jax.simulation.progress import Progress
 from gmem_jax.sweeps.cost import cost_of
@@ -70,7 +71,7 @@ def reproduce_command(
     executor_named(executor, workers, options)  # refuses an impossible executor before anything is written
     check_folder(output)
     output.mkdir(exist_ok=True)
-    outcomes, verdicts, drawn = [], [], []
+    outcomes, tested, drawn = [], None, []
     weighed: Outcome[Effect] = Outcome("choices", [], [], [])
     archives: list[Path] = []
     broken: list[str] = []
@@ -92,7 +93,8 @@ def reproduce_command(
                     log(f"wrote {path}")
         if wanted(["claims"]):
             with _going_on(broken), reporting(goes_on=True) as progress:
-                verdicts = reproduction(progress).claims()
+                tested = reproduction(progress).claims()
+                log(f"wrote {tested.path}")
         if wanted(["choices"]):
             with reporting(goes_on=True) as progress:
                 weighed = reproduction(progress).sensitivity()
@@ -109,13 +111,13 @@ def reproduce_command(
             _say_written(outcomes[-1])
     result = {
         "figures": [outcome_summary(outcome) for outcome in outcomes],
-        "claims": [verdict._asdict() for verdict in verdicts],
+        "claims": tested.rows() if tested else [],
         "choices": choices.effect_rows(weighed.rows),
         "pictures": [str(path) for path in drawn],
         "dataset": [str(path) for path in archives],
         "status": combined_status(statuses),
     }
-    lines = [f"{'yes' if verdict.holds else 'NO ':4}{verdict.claim}\n    {verdict.numbers}" for verdict in verdicts]
+    lines = _claims_lines(tested) if tested else []
     more = [_choices_table(weighed.rows)] if weighed.rows else []
     print_result(as_json, result, *lines, *more, *map(_table, outcomes))
     broken += weighed.failed + [reason for outcome in outcomes for reason in outcome.failed]
@@ -164,6 +166,18 @@ def _options(texts: Sequence[str]) -> dict[str, Any]:
             with contextlib.suppress(ValueError):
                 options[name] = kind(value)
     return options
+
+
+def _claims_lines(tested: Claims) -> list[str]:
+    """The verdicts, below the conditions of their runs."""
+    answers = {True: "yes", False: "NO", None: "?"}
+    lines = [f"claims on one pack, {tested.pack}: {tested.grains:,} grains, t0 = {tested.t0:,.0f} t_c"]
+    for verdict in tested.verdicts:
+        lines += [f"{answers[verdict.holds]:4}{verdict.claim}", f"    {verdict.numbers}"]
+        if verdict.holds is None:
+            why = explain(verdict.status) if verdict.status & UNTOLD else "a measure is no number"
+            lines.append(f"    cannot be told: {why}")
+    return lines
 
 
 def _say_written(done: Outcome[Any]) -> None:

@@ -15,6 +15,7 @@ from gmem_jax.experiment.record import values_of
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.datasets import plain_cell
 from gmem_jax.files.schemas import RECALL
+from gmem_jax.physics.numbers import plural
 from gmem_jax.reproduce.compare import ComputedPoint, counted
 from gmem_jax.sweeps.store import Store
 
@@ -25,7 +26,7 @@ README = """# Recalled waveforms of granular packs
 
 A jammed pack of frictional grains that is slowly compressed while a small shear waveform is applied gives the waveform
 back on decompression, as shear stress on its walls (arXiv:2603.14595). These are {count} such experiments, simulated by
-gmem_jax {version} (`gmem reproduce dataset --scale {scale}`): the points of figs. {figures} of the paper.
+gmem_jax {version} (`gmem reproduce dataset --scale {scale}`): the points of figs. {figures} of the paper.{missing}
 
 - points.csv: a line for each experiment: its file, the SHA-256 of that, the conditions, the pack's name and SHA-256,
   t0 (duration of one compression, in units of t_c = R sqrt(rho / E)), gain G and fidelity F, and the bits of its status
@@ -46,7 +47,9 @@ gmem_jax {version} (`gmem reproduce dataset --scale {scale}`): the points of fig
 """
 
 
-def write_dataset(path: Path, store: Store, points: Sequence[ComputedPoint], scale: str, t0: float) -> None:
+def write_dataset(
+    path: Path, store: Store, points: Sequence[ComputedPoint], scale: str, t0: float, failed: int = 0
+) -> None:
     """Write the archive (ZIP): README.md, points.csv, and the files of the recalls as they are.
 
     Args:
@@ -55,6 +58,7 @@ def write_dataset(path: Path, store: Store, points: Sequence[ComputedPoint], sca
         points: the points of the archive.
         scale: scale of the figures, as it was asked for.
         t0: t0 of that scale, in t_c, which decides which G and F count (`counted`).
+        failed: number of points that failed, and so are missing.
 
     Raises:
         OSError: if it cannot be written.
@@ -71,6 +75,7 @@ def write_dataset(path: Path, store: Store, points: Sequence[ComputedPoint], sca
         version=versions()["gmem-jax"],
         scale=scale,
         figures=", ".join(name.removeprefix("fig").lstrip("0") for name in COLLECTED),
+        missing=f"\nMissing: {plural(failed, 'more point')}, whose runs failed." if failed else "",
         schema=RECALL.name,
         example=points[0].key,
         measure=f"G and F of points.csv are {averaged}. Versions: {json.dumps(versions())}.",

@@ -235,9 +235,9 @@ def power(sizes: Mapping[int, Estimate]) -> tuple[float, float]:
             no error (NaN).
 
     Returns:
-        Exponent and error; NaN for fewer than two sizes.
+        Exponent and error; NaN for fewer than two sizes, or if a G is not positive.
     """
-    if len(sizes) < 2:
+    if len(sizes) < 2 or min(estimate.mean for estimate in sizes.values()) <= 0.0:
         return math.nan, math.nan
     size, mean = np.log(list(sizes)), np.array([estimate.mean for estimate in sizes.values()])
     relative = np.array([estimate.error for estimate in sizes.values()]) / mean
@@ -264,10 +264,12 @@ def _power_law(axis: Any, rows: Sequence[Compared]) -> None:
         if math.isnan(exponent):
             continue
         said.append(f"{whose} $N^{{{exponent:.3f}}}$" + ("" if math.isnan(error) else f" (± {error:.3f})"))
+    axis.set_title(", ".join(said), fontsize=8)
+    if min(estimate.mean for sizes in of_each.values() for estimate in sizes.values()) <= 0.0:
+        return  # such a G has no place on a logarithmic axis
     axis.set_yscale("log")
     axis.set_yticks(ticks := MaxNLocator(5).tick_values(*axis.get_ylim()), [f"{tick:g}" for tick in ticks])
     axis.set_yticks([], minor=True)
-    axis.set_title(", ".join(said), fontsize=8)
 
 
 def through_time(path: Path, recall: Recall, signal: int, title: str) -> None:

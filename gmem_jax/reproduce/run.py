@@ -104,6 +104,29 @@ class Outcome(NamedTuple, Generic[_Row]):
     failed: list[str]
 
 
+class Claims(NamedTuple):
+    """The tests of all claims on one pack.
+
+    Attributes:
+        pack: name of the pack.
+        grains: its number of grains N.
+        t0: duration of one compression, in t_c.
+        verdicts: a verdict on each claim.
+        path: the file written.
+    """
+
+    pack: str
+    grains: int
+    t0: float
+    verdicts: list[Verdict]
+    path: Path
+
+    def rows(self) -> list[dict[str, Any]]:
+        """The verdicts as JSON, each with its conditions."""
+        conditions = {"pack": self.pack, "grains": self.grains, "t0": self.t0}
+        return [{**verdict._asdict(), **conditions} for verdict in self.verdicts]
+
+
 @dataclass(frozen=True)
 class Reproduction:
     """Makes figures and tests claims of the paper. Finished runs in its folder are not run again.
@@ -192,12 +215,12 @@ class Reproduction:
         """
         require_x64()
         store = self._run(spec_for_all(COLLECTED, self.scale)).store
-        points, target = points_of(store), self._target("dataset", ".zip")
+        points, target, failed = points_of(store), self._target("dataset", ".zip"), _failed(store)
         if points:
-            write_dataset(target, store, points, self.scale, scale_of(self.scale).t0)
-        return [target] if points else [], _failed(store)
+            write_dataset(target, store, points, self.scale, scale_of(self.scale).t0, len(failed))
+        return [target] if points else [], failed
 
-    def claims(self) -> list[Verdict]:
+    def claims(self) -> Claims:
         """Run the points that the claims of the paper need, on one pack, test the claims, and write claims-SCALE.json.
 
         Raises:
@@ -210,9 +233,10 @@ class Reproduction:
             raise RunFailedError(failed[0])
         runs = [(row["values"], store.load(row["key"])) for row in store.card()["points"]]
         tetra, sphere = (runner.pack_of({**spec.shared, **runs[place][0]}) for place in (0, -1))
-        found = claims.verdicts(tetra, spec.shared["t0"], runs[:-1], {"sphere": sphere})
-        with atomic(self._target("claims", ".json")) as path:
-            path.write_text(json.dumps([verdict._asdict() for verdict in found], indent=1) + "\n", encoding="utf-8")
+        t0, target = spec.shared["t0"], self._target("claims", ".json")
+        found = Claims(tetra.name, tetra.grains, t0, claims.verdicts(tetra, t0, runs[:-1], {"sphere": sphere}), target)
+        with atomic(target) as path:
+            path.write_text(json.dumps(found.rows(), indent=1) + "\n", encoding="utf-8")
         return found
 
     def _runner(self, spec: Spec, cost: float = SECONDS_PER_GRAIN_STEP) -> SweepRunner:
@@ -236,7 +260,7 @@ class Reproduction:
     def _read_words(self, store: Store, points: Sequence[ComputedPoint], size: Scale) -> list[Compared]:
         """Accuracies with which recalled words are read, by nets that were trained on inputs only and by the baselines.
 
-        Nets are trained once and kept in the folder.
+        Nets are kept in the folder; those that ran out of time are trained on at each call.
         """
         found: dict[tuple[Conditions, str], list[float]] = {}
         status: dict[Conditions, int] = {}

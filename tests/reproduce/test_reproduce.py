@@ -7,6 +7,7 @@ import math
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -15,8 +16,10 @@ import pytest
 from scenes import TETRA_27
 
 import gmem_jax as gm
+from gmem_jax.command.reproduce import _claims_lines
 from gmem_jax.files.validation import require_kinds
-from gmem_jax.reproduce import claims, draw, figures
+from gmem_jax.physics.state import Status
+from gmem_jax.reproduce import claims, cost, draw, figures
 from gmem_jax.reproduce import run as reproducing
 from gmem_jax.reproduce.compare import (
     Compared,
@@ -35,6 +38,7 @@ from gmem_jax.reproduce.draw import power
 from gmem_jax.reproduce.figures import FIGURES, SCALES, PaperFigure, packs, scale_of
 from gmem_jax.reproduce.run import Reproduction
 from gmem_jax.show.numbers import published
+from gmem_jax.show.render_matplotlib import pyplot
 from gmem_jax.sweeps.executors import Executor
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.work import work
@@ -384,10 +388,17 @@ def test_the_physics_gives_the_stored_numbers(t0: float, stored: tuple[float, ..
 @pytest.mark.slow
 def test_claims_are_judged_by_their_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(SCALES, "tiny", TINY)
-    monkeypatch.setattr(reproducing, "packs", lambda *_, **__: [{"pack": PACK}])
+    monkeypatch.setattr(cost, "packs", lambda *_, **__: [{"pack": PACK}])
     monkeypatch.setattr(reproducing, "quick_cost", lambda points: 1e-7)
-    found = Reproduction(tmp_path, "tiny", Here(), say=lambda line: None).claims()
-    assert [row["claim"] for row in json.loads((tmp_path / "claims-tiny.json").read_text())] == [v.claim for v in found]
+    tested = Reproduction(tmp_path, "tiny", Here(), say=lambda line: None).claims()
+    found, written = tested.verdicts, json.loads((tmp_path / "claims-tiny.json").read_text())
+    assert [row["claim"] for row in written] == [verdict.claim for verdict in found]
+    assert {(row["pack"], row["grains"], row["t0"]) for row in written} == {(tested.pack, 27, 150.0)}
+    # 27 grains at this rate lose the walls, or follow them too late: no claim is tested by such runs.
+    assert all((verdict.holds is None) == bool(verdict.status & claims.UNTOLD) for verdict in found)
+    lines = _claims_lines(tested)
+    assert "27 grains, t0 = 150 t_c" in lines[0]
+    assert sum(line.strip().startswith("cannot be told: ") for line in lines) == sum(one.holds is None for one in found)
     assert len(found) == 8
     by_claim = {verdict.claim: verdict for verdict in found}
     order = by_claim["shear before the compression leaves no waveform"]
@@ -408,5 +419,32 @@ def test_a_claim_that_fails_is_said_to() -> None:
     louder = replace(recall, windowed_gain=1.2 * recall.windowed_gain)
     assert not claims.proportional({1e-3: recall, 3e-3: louder}).holds
     assert claims.proportional({1e-3: recall, 3e-3: recall}).holds
-    worse = replace(recall, windowed_fidelity=recall.windowed_fidelity - 0.03)
-    assert not claims.storage_costs_nothing({0.5: recall, 2.0: worse}).holds
+    good = replace(recall, windowed_fidelity=0.8)
+    for worse in (0.77, -0.02, np.nan):
+        assert not claims.storage_costs_nothing({0.5: good, 2.0: replace(recall, windowed_fidelity=worse)}).holds
+    forgets = {store: replace(recall, windowed_fidelity=0.01) for store in (0.5, 2.0)}
+    assert not claims.storage_costs_nothing(forgets).holds
+    for gains in ((-0.3, -0.2), (-0.3, 0.2), (0.3, -0.01), (0.3, np.nan)):
+        runs = {k: replace(recall, windowed_gain=gain) for k, gain in enumerate(gains)}
+        assert not claims.proportional(runs).holds
+
+
+@pytest.mark.parametrize(("bits", "gain"), [(0, 0.3), (Status.RINGING, 0.3), (Status.UNLOADED, 0.3), (0, np.nan)])
+def test_a_run_that_is_no_evidence_gives_no_answer(bits: int, gain: float) -> None:
+    recall = SimpleNamespace(status=np.asarray([0, int(bits)]))
+    verdict = claims._told(claims.Verdict("so", True, "", {"G": {1e-3: gain}, "spread": 0.1}), recall)  # type: ignore[arg-type]
+    assert verdict.holds is (None if bits == Status.UNLOADED or np.isnan(gain) else True)
+    assert verdict.status == int(bits)
+
+
+def test_a_gain_that_is_not_positive_is_drawn_on_a_linear_axis(tmp_path: Path) -> None:
+    def row(grains: int, gain: float) -> Compared:
+        mean = Estimate(gain, 0.01, 3)
+        return compared(replace(STANDARD, grains=grains), "G", [gain - 0.01, gain, gain + 0.01], 0)._replace(ours=mean)
+
+    for gains, scale in (((0.2, 0.3), "log"), ((-0.2, 0.3), "linear")):
+        axis = pyplot().figure().add_subplot()
+        rows = [row(grains, gain) for grains, gain in zip((325, 1024), gains, strict=True)]
+        draw._power_law(axis, rows)
+        assert axis.get_yscale() == scale
+        assert ("ours" in axis.get_title()) == (scale == "log")
