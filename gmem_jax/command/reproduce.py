@@ -13,10 +13,9 @@ from gmem_jax.command.console import AsJson, DryRun, InputError, log, print_resu
 from gmem_jax.command.resuming import check_folder
 from gmem_jax.errors import RunFailedError
 from gmem_jax.files.checkpoints import locked
-from gmem_jax.physics.state import combined_status, explain
+from gmem_jax.physics.state import combined_status
 from gmem_jax.reproduce import choices
 from gmem_jax.reproduce.choices import Effect
-from gmem_jax.reproduce.claims import UNTOLD
 from gmem_jax.reproduce.compare import Compared
 from gmem_jax.reproduce.cost import spec_for_all
 from gmem_jax.reproduce.dataset import COLLECTED
@@ -175,8 +174,7 @@ def _claims_lines(tested: Claims) -> list[str]:
     for verdict in tested.verdicts:
         lines += [f"{answers[verdict.holds]:4}{verdict.claim}", f"    {verdict.numbers}"]
         if verdict.holds is None:
-            why = explain(verdict.status) if verdict.status & UNTOLD else "a measure is no number"
-            lines.append(f"    cannot be told: {why}")
+            lines.append(f"    cannot be told: {verdict.why}")
     return lines
 
 

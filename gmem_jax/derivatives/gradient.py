@@ -33,6 +33,7 @@ from gmem_jax.experiment.asked import require_host
 from gmem_jax.experiment.changes import replace as with_values
 from gmem_jax.experiment.experiment import Experiment, acts_on_prefix
 from gmem_jax.experiment.run import apply_waveforms, runner_of
+from gmem_jax.physics.numbers import said
 from gmem_jax.physics.pytree import comparable, short_repr
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import State
@@ -218,7 +219,10 @@ def value_and_grad(
     require_host("gm.value_and_grad", experiment)
     require_derivatives(experiment)
     tell = callback(progress)
-    theta, along = theta_of(experiment, by), functools.partial(with_values, experiment)
+    theta = theta_of(experiment, by)
+    if of_grain := {name: part for name, part in theta.items() if name.startswith("pack.clump")}:
+        experiment = with_values(experiment, of_grain)  # whose grain may have three moments of inertia now
+    along = functools.partial(with_values, experiment)
     common, own = experiment.phases
     on = runner_of(experiment, progress=within(tell, 0.0, FORWARDS))
     on.total_work = whole_work(experiment, on)
@@ -236,6 +240,8 @@ def value_and_grad(
         changed = along(theta)
         p_sig = changed.recalled(pressures)
         value = loss(changed, p_sig)
+        if not isinstance(value, float) and not jnp.issubdtype(getattr(value, "dtype", np.int64), jnp.floating):
+            raise ValueError(f"a loss is one real number, got {said(value)}")
         if jnp.ndim(value):
             raise ValueError(
                 f"a loss is one number, got {jnp.shape(value)}: with several reads or channels give one, as "

@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment.arguments import require_several
+from gmem_jax.experiment.changes import anisotropic, value_at
 from gmem_jax.experiment.changes import replace as with_values
-from gmem_jax.experiment.changes import value_at
 from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.physics.numbers import said
 from gmem_jax.physics.state import State
 from gmem_jax.simulation.loop import Simulation
 from gmem_jax.simulation.progress import work_of
@@ -87,7 +88,10 @@ def theta_of(experiment: Experiment, names: Any) -> dict[str, Any]:
         ValueError: if there is no part of that name, it has no derivative, or it is within another.
     """
     require_several(names, "by")
-    found = {name: value_at(experiment, name) for name in names}
+    names = [*names]
+    if wrong := [name for name in names if not isinstance(name, str)]:
+        raise ValueError(f"by must hold names, as in ['gamma0', 'friction.mu']; got {said(wrong[0])}")
+    found = {name: anisotropic(value_at(experiment, name)) for name in names}
     for name, tree in found.items():
         if inside := next((other for other in found if name.startswith(f"{other}.")), ""):
             raise ValueError(f"{name} is part of {inside}; name one of them")
@@ -101,7 +105,7 @@ def theta_of(experiment: Experiment, names: Any) -> dict[str, Any]:
     theta = {name: jax.tree.map(jnp.asarray, tree) for name, tree in found.items()}
     for name, tree in theta.items():
         if isinstance(tree, jax.Array) and jnp.issubdtype(tree.dtype, jnp.integer):
-            raise ValueError(f"{name} holds whole numbers: write them as floats")
+            raise ValueError(f"{name} holds whole numbers, which have no derivative; write a number as 1.0")
         if not all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in jax.tree.leaves(tree)):
             raise ValueError(f"{name} holds more than floats; name what to differentiate by, like pack.position")
     return theta

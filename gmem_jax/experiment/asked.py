@@ -16,10 +16,11 @@ from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.numbers import require_numbers, said
 from gmem_jax.physics.pairs import sphere_offsets
-from gmem_jax.physics.pytree import Scalar, traced
+from gmem_jax.physics.pytree import Scalar, interval, traced
 from gmem_jax.physics.rotation import unit
 from gmem_jax.simulation.protocol import Protocol
 from gmem_jax.simulation.stage import BINS
+from gmem_jax.simulation.strain import COMPRESSIONS
 
 FASTEST_CREEP = 0.05  # part of an elastic force that may relax in a bin: creep acts once in each bin
 
@@ -204,6 +205,58 @@ def require_told_apart(readings: Readings, integrals: np.ndarray) -> None:
                 f"the waveforms of channels {' and '.join(channels)} are alike in all replicas: what one gives back "
                 "cannot be told from the other's; store them in different orders, or one set with its signs changed"
             )
+
+
+def require_finite_waveforms(ends: np.ndarray, integrals: np.ndarray) -> None:
+    """Refuse waveforms that are not finite numbers everywhere.
+
+    Args:
+        ends: the waveforms at u = 0 and u = 1, [2, S].
+        integrals: their integrals, averaged over each bin, [S, bins].
+
+    Raises:
+        ValueError: naming the first such waveform.
+    """
+    odd = ~(np.all(np.isfinite(ends), axis=0) & np.all(np.isfinite(integrals), axis=1))
+    if np.any(odd):
+        raise ValueError(f"waveform {np.argmax(odd) + 1} is not a finite number at every u")
+
+
+def require_pack(pack: Pack) -> None:
+    """Refuse a pack whose arrays have wrong shapes, or whose numbers cannot be those of a pack.
+
+    Raises:
+        ValueError: naming the first such array or number.
+    """
+    if jnp.ndim(pack.position) != 2:
+        raise ValueError(
+            f"an experiment has one pack: positions [N, 3], got {jnp.shape(pack.position)}; put a stack of "
+            "packs into jax.vmap"
+        )
+    grain, spheres = pack.clump, len(pack.pairs.reference)
+    shapes = {
+        "position": (pack.position, (pack.grains, 3)),
+        "quaternion": (pack.quaternion, (pack.grains, 4)),
+        "lower": (pack.lower, (3,)),
+        "upper": (pack.upper, (3,)),
+        "delta0": (pack.delta0, ()),
+        "clump.offsets": (grain.offsets, (spheres // pack.grains, 3)),
+        "clump.mass": (grain.mass, ()),
+        "clump.inertia": (grain.inertia, (3,)),
+    }
+    for name, (value, wanted) in shapes.items():
+        if jnp.shape(value) != wanted:
+            raise ValueError(f"pack.{name} must have the shape {wanted}, got {jnp.shape(value)}")
+    if not traced(pack.delta0) and not interval(COMPRESSIONS).holds(np.asarray(pack.delta0)):
+        raise ValueError(f"pack.delta0 must be in {COMPRESSIONS}, got {float(pack.delta0):g}")
+    for name, value in (("mass", grain.mass), ("inertia", grain.inertia)):
+        if not traced(value) and not np.all(np.asarray(value) > 0.0):
+            raise ValueError(f"pack.clump.{name} must be positive, got {said(value)}")
+    if grain.isotropic and not traced(grain.inertia):
+        moments = np.asarray(grain.inertia)
+        if np.ptp(moments) > 1e-3 * np.mean(moments):
+            few = ", ".join(f"{moment:g}" for moment in moments)
+            raise ValueError(f"pack.clump is marked isotropic, but its moments are {few}: set isotropic=False")
 
 
 def require_seen(middles: np.ndarray, integrals: np.ndarray) -> None:

@@ -9,6 +9,8 @@ from typing import Any
 from gmem_jax.experiment.arguments import require_kind, require_once
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.signals import Signals, SignalSets, part, sets_of, signals
+from gmem_jax.physics.grain import Clump
+from gmem_jax.physics.numbers import said
 from gmem_jax.physics.pytree import traced, with_field
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.protocol import Protocol
@@ -30,6 +32,8 @@ def replace(experiment: Experiment, values: Mapping[str, Any] | None = None, /, 
         ValueError: if there is no such field, a field is given twice, or the new experiment is impossible.
     """
     require_kind("replace", experiment, Experiment)
+    if values is not None and not (isinstance(values, Mapping) and all(isinstance(name, str) for name in values)):
+        raise ValueError(f'replace takes new values by name, as in {{"friction.mu": 0.5}}; got {said(values)}')
     found: dict[str, Any] = dict(changes)
     require_once(values or {}, changes)
     for path, value in (values or {}).items():
@@ -68,7 +72,18 @@ def _with(tree: Any, path: list[str], value: Any) -> Any:
         sets = [_with(one, path[1:], value) if name == path[0] else one for name, one in sets_of(tree).items()]
         return SignalSets(tuple(sets), tree.names)
     _require_field(tree, path[0])
-    return with_field(tree, path[0], _with(getattr(tree, path[0]), path[1:], value))
+    changed = with_field(tree, path[0], _with(getattr(tree, path[0]), path[1:], value))
+    return anisotropic(changed) if path[0] == "inertia" else changed
+
+
+def anisotropic(tree: Any) -> Any:
+    """A part of an experiment whose grain, if it has one, has three moments of inertia, be they equal or not.
+
+    A grain that is marked isotropic has one: its first moment counts alone.
+    """
+    if not isinstance(tree, Clump):
+        return tree
+    return with_field(tree, "isotropic", False)
 
 
 def value_at(experiment: Experiment, path: str) -> Any:

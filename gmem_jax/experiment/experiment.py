@@ -16,7 +16,9 @@ from gmem_jax.experiment.arguments import named_observers, require_parts
 from gmem_jax.experiment.asked import (
     require_data,
     require_double,
+    require_finite_waveforms,
     require_memory,
+    require_pack,
     require_seen,
     require_slippery,
     require_slow_creep,
@@ -293,11 +295,7 @@ class Experiment:
                     "jax.tree_util.register_dataclass"
                 )
         require_data(signals=self.signals, friction=self.friction)
-        if jnp.ndim(self.pack.position) != 2:
-            raise ValueError(
-                f"an experiment has one pack: positions [N, 3], got {jnp.shape(self.pack.position)}; put a stack of "
-                "packs into jax.vmap"
-            )
+        require_pack(self.pack)
         for name, value in vars(self.material).items():
             if jnp.shape(value) != ():
                 raise ValueError(f"material.{name} must be one number, of all replicas; got shape {jnp.shape(value)}")
@@ -317,7 +315,8 @@ class Experiment:
             with jax.ensure_compile_time_eval():
                 ends, within = (np.asarray(values) for values in _probe(one))
                 integrals = np.asarray(bin_average(one))
-            if not np.all(np.isfinite(ends)) or np.max(np.abs(ends)) > _OPEN:
+            require_finite_waveforms(ends, integrals)
+            if np.max(np.abs(ends)) > _OPEN:
                 raise ValueError(f"waveforms must vanish at u = 0 and u = 1; found {np.abs(ends).max():g} there")
             loud.append(np.any(within) or np.any(integrals))
             require_seen(within, integrals)
@@ -415,6 +414,7 @@ class Experiment:
         for one in self.sets.values():
             ends = _ends(one)
             impossible |= ~jnp.all(jnp.isfinite(ends) & (jnp.abs(ends) <= _OPEN))
+            impossible |= ~jnp.all(jnp.isfinite(one.integral(jnp.asarray(1.0))))
         return impossible
 
     def fan_out(self, state: State) -> State:

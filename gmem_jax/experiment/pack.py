@@ -12,6 +12,7 @@ import numpy as np
 from gmem_jax.experiment.html import Facts, brief, facts, line
 from gmem_jax.physics.boundary import WALLS, PeriodicAxes, boundary_of
 from gmem_jax.physics.grain import Clump, words_of_sizes
+from gmem_jax.physics.numbers import said
 from gmem_jax.physics.pairs import Pairs, listed_candidates, tabulate
 from gmem_jax.physics.pytree import label, pytree, static
 from gmem_jax.physics.rotation import unit
@@ -151,6 +152,11 @@ def stack(packs: Sequence[Pack]) -> Pack:
     if not packs:
         raise ValueError("stack needs at least one pack")
     first = packs[0]
+    for pack in packs:
+        if not isinstance(pack, Pack):
+            raise ValueError(f"stack takes packs, got {said(pack)}")
+        if np.ndim(pack.position) != 2:
+            raise ValueError(f"stack takes single packs; {pack.name} is a stack already")
     for pack in packs[1:]:
         if pack.grains != first.grains or pack.clump.shape != first.clump.shape:
             raise ValueError(

@@ -135,6 +135,8 @@ class Bumps:
         if len(given) != 2 or places not in (given, (1, given[1])) or width not in ((), (given[0], 1)):
             wanted = "amplitudes must be [S, b], centres [S, b] or [1, b], width a number or [S, 1]"
             raise ValueError(f"{wanted}; got {said(shapes)}")
+        if not traced(self.width) and not np.all(np.asarray(self.width) > 0.0):
+            raise ValueError(f"the width of bumps must be positive, got {said(self.width)}")
 
     def __repr__(self) -> str:
         return line(
@@ -169,12 +171,18 @@ class Spline:
 
     Attributes:
         nodes: I_s at the n + 2 nodes u = k / (n + 1), k = 0..n + 1, [S, n + 2]; the first and the last are zero.
+
+    Raises:
+        ValueError: for values that are no numbers, or not of this shape.
     """
 
     nodes: jax.Array
 
     def __post_init__(self) -> None:
         _require_arrays(self)
+        shape = jnp.shape(self.nodes)
+        if len(shape) < 2 or shape[-1] < 3:
+            raise ValueError(f"nodes must be [S, n + 2], n samples and two zeros; got {said(shape)}")
 
     def __repr__(self) -> str:
         return line(self, lambda: (plural(self.count, "signal"), {"nodes": self.nodes.shape[-1]}))

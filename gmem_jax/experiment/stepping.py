@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment.arguments import require_kind
+from gmem_jax.experiment.asked import require_host
 from gmem_jax.experiment.changes import replace as with_changes
 from gmem_jax.experiment.experiment import USUAL_STEP, Experiment
 from gmem_jax.experiment.identity import fingerprint, identity
@@ -51,10 +52,11 @@ def stable_step(experiment: Experiment) -> float:
         The step, at most 2 t_c; 0 if not even 0.1 t_c is stable.
 
     Raises:
-        ValueError: if JAX's 64-bit mode is off.
+        ValueError: if JAX's 64-bit mode is off, the experiment is traced, or in a call inside a traced function.
     """
     require_kind("stable_step", experiment, Experiment)
     require_x64()
+    require_host("gm.stable_step", experiment)
     key, law = _case(experiment)
     if key not in _known:
         _known[key] = largest_stable_step(*_at_rest(experiment, law))

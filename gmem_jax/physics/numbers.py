@@ -42,6 +42,18 @@ def require_numbers(**values: Any) -> None:
             raise ValueError(f"{name} must be a number, got {said(value)}")
 
 
+def require_static(**values: Any) -> None:
+    """Refuse tracers of JAX, and what `require_numbers` refuses.
+
+    Raises:
+        ValueError: naming the first such value.
+    """
+    for name, value in values.items():
+        if isinstance(value, jax.core.Tracer):
+            raise ValueError(f"{name} is fixed when a program is compiled: it must be a number, not traced")
+    require_numbers(**values)
+
+
 def require_whole(name: str, value: Any, least: int = 0) -> int:
     """An integer of any type, as an int.
 

@@ -18,7 +18,8 @@ from gmem_jax.experiment.signals import six_signals
 from gmem_jax.physics.census import overlaps
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
-from gmem_jax.physics.state import Status, combined_status
+from gmem_jax.physics.numbers import plural
+from gmem_jax.physics.state import Status, combined_status, explain
 from gmem_jax.reproduce.figures import Values, crossed
 from gmem_jax.show.tables import decimal
 from gmem_jax.simulation.stage import BINS
@@ -42,6 +43,7 @@ class Verdict(NamedTuple):
         numbers: the measured numbers, in a line.
         values: the measured numbers by name.
         status: bits of `Status` of its runs.
+        why: why it cannot be told; "" if it can.
     """
 
     claim: str
@@ -49,6 +51,7 @@ class Verdict(NamedTuple):
     numbers: str
     values: dict[str, Any]
     status: int = 0
+    why: str = ""
 
 
 def stress_is_minus_j(recall: Recall) -> Verdict:
@@ -149,17 +152,24 @@ def rearrangement(pack: Pack, friction: Any, t0: float) -> float:
     return float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
 
 
-def rearranges(packs: dict[str, Pack], t0: float) -> Verdict:
-    """Tetra grains rearrange less than spheres over a cycle, and grains without friction most."""
-    found = {name: rearrangement(pack, Hooke(), t0) for name, pack in packs.items()}
-    found["tetra without friction"] = rearrangement(packs["tetra"], Frictionless(), t0)
-    said = ", ".join(f"{moved:.1e} R ({name})" for name, moved in found.items())
-    order = found["tetra"] < found.get("sphere", np.inf) and found["tetra"] < found["tetra without friction"]
+def rearranges(tetra: Sequence[Pack], spheres: Sequence[Pack], t0: float) -> Verdict:
+    """Tetra grains rearrange less than spheres over a cycle, and grains without friction most.
+
+    Packs differ, so that several of each are compared. The claim holds or fails if the means are more than two standard
+    errors of their difference apart.
+    """
+    packs = {"tetra": (tetra, Hooke()), "sphere": (spheres, Hooke()), "tetra without friction": (tetra, Frictionless())}
+    found = {name: spread([rearrangement(pack, law, t0) for pack in some]) for name, (some, law) in packs.items()}
+    said = ", ".join(f"{mean:.1e} ± {error:.1e} R ({name})" for name, (mean, _, error) in found.items())
+    (own, _, error), *others = found.values()
+    apart = [(mean - own) / np.hypot(other, error) for mean, _, other in others]
+    known = min(apart) > 2.0 or min(apart) < -2.0
     return Verdict(
         "tetra grains rearrange less than spheres, and less than without friction",
-        bool(order),
-        f"displacement that a cycle leaves: {said}",
-        found,
+        min(apart) > 2.0 if known else None,
+        f"displacement that a cycle leaves: {said} (mean and SE over {plural(len(tetra), 'pack')})",
+        {name: mean for name, (mean, _, _) in found.items()},
+        why="" if known else "these packs differ by as much" if len(tetra) > 1 else "one pack of each has no error",
     )
 
 
@@ -200,16 +210,17 @@ def claim_points(packs: Sequence[Values]) -> list[Values]:
 
 
 def verdicts(
-    pack: Pack, t0: float, runs: Sequence[tuple[Values, Recall]], others: Mapping[str, Pack] | None = None
+    tetra: Sequence[Pack], spheres: Sequence[Pack], t0: float, runs: Sequence[tuple[Values, Recall]]
 ) -> list[Verdict]:
-    """Every claim on one pack.
+    """Every claim on one pack, but that on rearrangement on all.
 
     Args:
-        pack: a pack of tetra grains.
+        tetra: packs of tetra grains; the first is that of the runs.
+        spheres: packs of spheres.
         t0: duration of one compression, in t_c.
-        runs: values and recalls of `claim_points` on this pack.
-        others: packs of other grains by name, for the claim on rearrangement.
+        runs: values and recalls of `claim_points` on the first pack.
     """
+    pack = tetra[0]
 
     def having(**wanted: Any) -> Recall:
         own = ({name: values[name] for name in VARIED if name in values} for values, _ in runs)
@@ -229,7 +240,7 @@ def verdicts(
         _told(reading_erases(twice, scale), twice),
         _told(order_matters(plain, before, scale), plain, before),
         _told(proportional(amplitudes), *amplitudes.values()),
-        _told(rearranges({"tetra": pack, **(others or {})}, t0), plain),
+        _told(rearranges(tetra, spheres, t0), plain),
         _told(forces_tell_nothing(standard), plain),
     ]
 
@@ -239,5 +250,8 @@ def _told(verdict: Verdict, *recalls: Recall) -> Verdict:
     status = combined_status([combined_status(recall.status) for recall in recalls])
     known = [*verdict.values.values()]
     numbers = [number for one in known for number in (one.values() if isinstance(one, Mapping) else (one,))]
-    holds = None if status & UNTOLD or np.any(np.isnan(numbers)) else verdict.holds
-    return verdict._replace(holds=holds, status=status)
+    if status & UNTOLD:
+        verdict = verdict._replace(holds=None, why=explain(status))
+    elif np.any(np.isnan(numbers)):
+        verdict = verdict._replace(holds=None, why="a measure is no number")
+    return verdict._replace(status=status)

@@ -12,14 +12,16 @@ from gmem_jax.sweeps.spec import Spec
 def spec_for(name: str, scale: str) -> Spec:
     """The sweep of all points that a figure of `FIGURES`, the packs of `GALLERY`, "claims" or "choices" need.
 
-    The last point of the claims is that of a pack of spheres. All values of a choice are run on the same packs.
+    The last points of the claims are those of more packs, half of them of spheres, for the claim on rearrangement. All
+    values of a choice are run on the same packs.
 
     Raises:
         ValueError: if there is no such scale.
     """
     size = scale_of(scale, choices.SIZES if name == "choices" else SCALES)
     if name == "claims":
-        points = [*claims.claim_points(packs(size, size.grains, 1)), *packs(size, size.grains, 1, shape="sphere")]
+        own, *others = packs(size, size.grains, size.packs)
+        points = [*claims.claim_points([own]), *others, *packs(size, size.grains, size.packs, shape="sphere")]
     elif name == "choices":
         points = choices.choice_points(packs(size, size.grains, size.few))
     else:

@@ -221,7 +221,9 @@ class Reproduction:
         return [target] if points else [], failed
 
     def claims(self) -> Claims:
-        """Run the points that the claims of the paper need, on one pack, test the claims, and write claims-SCALE.json.
+        """Run the points that the claims of the paper need, test the claims on one pack, and write claims-SCALE.json.
+
+        The claim on rearrangement is tested on as many packs, tetra grains and spheres, as a point of the scale has.
 
         Raises:
             RunFailedError: if a point failed, so that a claim cannot be tested.
@@ -231,10 +233,12 @@ class Reproduction:
         store = runner.store
         if failed := _failed(store):
             raise RunFailedError(failed[0])
-        runs = [(row["values"], store.load(row["key"])) for row in store.card()["points"]]
-        tetra, sphere = (runner.pack_of({**spec.shared, **runs[place][0]}) for place in (0, -1))
+        points, many = store.card()["points"], scale_of(self.scale).packs
+        made = [runner.pack_of({**spec.shared, **row["values"]}) for row in (points[0], *points[1 - 2 * many :])]
+        tetra, spheres = made[:many], made[many:]
+        runs = [(row["values"], store.load(row["key"])) for row in points[: 1 - 2 * many]]
         t0, target = spec.shared["t0"], self._target("claims", ".json")
-        found = Claims(tetra.name, tetra.grains, t0, claims.verdicts(tetra, t0, runs[:-1], {"sphere": sphere}), target)
+        found = Claims(tetra[0].name, tetra[0].grains, t0, claims.verdicts(tetra, spheres, t0, runs), target)
         with atomic(target) as path:
             path.write_text(json.dumps(found.rows(), indent=1) + "\n", encoding="utf-8")
         return found

@@ -260,10 +260,37 @@ def test_names_that_cannot_be_differentiated_by_are_refused(experiment: gm.Exper
     with pytest.raises(ValueError, match="steps is fixed when a program is compiled and has no derivative"):
         gm.value_and_grad(experiment, ["steps"])
     whole = gm.replace(experiment, signals=gm.Bumps(jnp.asarray([[1, -1]]), CENTRES, 0.2))
-    with pytest.raises(ValueError, match=r"signals\.amplitudes holds whole numbers: write them as floats"):
+    with pytest.raises(ValueError, match=r"signals\.amplitudes holds whole numbers, which have no derivative"):
         gm.value_and_grad(whole, ["signals.amplitudes"])
     with pytest.raises(ValueError, match="the experiment has no gravity: give it a number first"):
         gm.value_and_grad(experiment, ["gravity"])
+    with pytest.raises(ValueError, match=r"by must hold names, as in \['gamma0', 'friction.mu'\]; got 1"):
+        gm.value_and_grad(experiment, [1])
+
+
+@pytest.mark.parametrize("value", [None, 3, (1.0, 2.0)], ids=repr)
+def test_a_loss_that_is_no_real_number_is_refused(experiment: gm.Experiment, value: Any) -> None:
+    protocol = gm.Protocol(gm.write(length=0.02), gm.read(length=0.02))
+    short = gm.Experiment(experiment.pack, experiment.signals, t0=75.0, protocol=protocol)
+    with pytest.raises(ValueError, match="a loss is one real number, got"):
+        gm.value_and_grad(short, ["gamma0"], loss=lambda *_: value, progress=False)
+
+
+def test_each_moment_of_inertia_acts_on_a_grain_that_was_marked_isotropic(experiment: gm.Experiment) -> None:
+    name, moments = "pack.clump.inertia", experiment.pack.clump.inertia
+    protocol = gm.Protocol(gm.write(length=0.15), gm.hold(0.02), gm.read(length=0.15))
+    one = gm.Experiment(experiment.pack, experiment.signals, t0=200.0, dt=0.4, protocol=protocol, gamma0=5e-3)
+
+    def loss(_: Any, p_sig: Any) -> jax.Array:
+        return jnp.sum(jnp.sin(1e4 * p_sig))
+
+    found = gm.value_and_grad(one, [name], loss=loss, progress=False).slope[name]
+    for axis, moment in enumerate(np.asarray(moments)):
+        step = 1e-6 * moment
+        ends = [gm.replace(one, {name: moments.at[axis].add(sign * step)}) for sign in (1.0, -1.0)]
+        up, down = (float(loss(end, gm.run(end, progress=False).p_sig)) for end in ends)
+        assert float(found[axis]) == pytest.approx((up - down) / (2.0 * step), rel=1e-4)
+    assert np.ptp(found) > 0.1 * np.abs(found).max()
 
 
 def test_a_jacobian_of_several_signals_is_refused(experiment: gm.Experiment) -> None:

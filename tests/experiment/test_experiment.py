@@ -78,6 +78,40 @@ def test_waveforms_that_cannot_be_are_refused() -> None:
         gm.Experiment(PACK, gm.Bumps(jnp.zeros((2, 1)), jnp.full((2, 1), 0.5), 0.2))
     with pytest.raises(ValueError, match="real samples"):
         gm.waveform(np.asarray([0.1j, 0.2, 0.3]))
+    two, nan = (jnp.ones((2, 1)), jnp.full((2, 1), 0.5)), jnp.asarray([[0.5], [jnp.nan]])
+    for bad in (gm.Bumps(two[0], nan, 0.2), gm.Bumps(nan, two[1], 0.2), gm.Spline(jnp.pad(nan, ((0, 0), (1, 1))))):
+        with pytest.raises(ValueError, match="waveform 2 is not a finite number at every u"):
+            gm.Experiment(PACK, bad)
+    for width in (0.0, jnp.nan, -0.1):
+        with pytest.raises(ValueError, match="the width of bumps must be positive"):
+            gm.Bumps(*two, width)
+    for nodes in (jnp.zeros(5), jnp.zeros((1, 2))):
+        with pytest.raises(ValueError, match=r"nodes must be \[S, n \+ 2\], n samples and two zeros; got"):
+            gm.Spline(nodes)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("position", PACK.position.T, r"position must have the shape \(3, 3\), got \(3, 27\)"),
+        ("quaternion", PACK.quaternion[:, :3], r"quaternion must have the shape \(27, 4\), got \(27, 3\)"),
+        ("lower", PACK.lower[0], r"lower must have the shape \(3,\), got \(\)"),
+        ("delta0", 0.7, r"delta0 must be in \[1e-9, 0.5\), got 0.7"),
+        ("clump.mass", -1.0, "clump.mass must be positive, got -1.0"),
+        ("clump.inertia", PACK.clump.inertia[:2], r"clump.inertia must have the shape \(3,\)"),
+        ("clump.offsets", PACK.clump.offsets[:2], r"clump.offsets must have the shape \(4, 3\), got \(2, 3\)"),
+    ],
+)
+def test_packs_of_other_shapes_are_refused_by_name(name: str, value: Any, words: str) -> None:
+    with pytest.raises(ValueError, match=f"pack.{words}"):
+        gm.replace(make(), {f"pack.{name}": value})
+
+
+def test_moments_that_differ_need_a_grain_that_is_not_marked_isotropic() -> None:
+    grain = replace(PACK.clump, inertia=PACK.clump.inertia * jnp.asarray([0.5, 1.0, 2.0]))
+    with pytest.raises(ValueError, match=r"is marked isotropic, but its moments are 3\.46573, 6\.93145, 13\.8629"):
+        gm.Experiment(replace(PACK, clump=grain), BUMP)
+    assert not gm.replace(make(), {"pack.clump.inertia": grain.inertia}).pack.clump.isotropic
 
 
 def test_a_law_that_jax_does_not_know_is_refused_at_once() -> None:
@@ -212,8 +246,9 @@ def test_a_stack_of_packs_is_refused_at_once() -> None:
         lambda e, bad: gm.replace(e, delta0=bad),
         lambda e, bad: gm.replace(e, {"material.poisson": bad - 2.0}),
         lambda e, bad: gm.replace(e, {"signals.centres": jnp.asarray([[0.3, 0.97]]) + 0.0 * bad}),
+        lambda e, bad: gm.replace(e, {"signals.centres": jnp.asarray([[0.3, 0.7]]) + jnp.nan * bad}),
     ],
-    ids=["gamma0", "mu", "delta0", "poisson", "open waveform"],
+    ids=["gamma0", "mu", "delta0", "poisson", "open waveform", "a bump that is nowhere"],
 )
 def test_what_is_traced_sets_a_fatal_bit_and_turns_all_into_nan(broken: Any) -> None:
     experiment = make()
