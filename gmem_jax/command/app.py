@@ -1,5 +1,6 @@
 """The `gmem` command. Exit code 0: done; 2: bad input, said in one line; 1: the run failed; 130: interrupted."""
 
+import io
 import os
 import sys
 import warnings
@@ -171,7 +172,10 @@ def _of_jax(error: Exception) -> str:
 
 
 def _open_streams() -> None:
-    """Open closed standard streams on the null device, so that no file opened later gets their numbers."""
+    """Open closed standard streams on the null device, so that no file opened later gets their numbers.
+
+    Letters that the locale cannot write become question marks, so that a result is never cut off by one.
+    """
     for number in range(3):
         try:
             os.fstat(number)
@@ -179,6 +183,8 @@ def _open_streams() -> None:
             os.open(os.devnull, os.O_RDWR)  # the lowest number that is free
     sys.stdout = sys.stdout or open(1, "w", encoding="utf-8", closefd=False)  # noqa: SIM115
     sys.stderr = sys.stderr or open(2, "w", encoding="utf-8", closefd=False)  # noqa: SIM115
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")
 
 
 def main() -> None:

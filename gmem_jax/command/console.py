@@ -5,6 +5,7 @@ import errno
 import json
 import math
 import os
+import stat
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -64,7 +65,7 @@ out = _Out(highlight=False, markup=False, emoji=False)
 LONGEST_DURATION = 3e9  # seconds, a century: longer runs are a mistake
 LOG_INTERVAL = 30.0  # seconds between lines of progress where there is no terminal
 
-Output = Annotated[Path, typer.Option("-o", "--output", help="File to write.")]
+Output = Annotated[Path, typer.Option("-o", "--output", readable=False, help="File to write.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout; logs go to stderr.")]
 Picture = Annotated[bool, typer.Option(help="Also draw a picture, beside the output.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace outputs that exist.")]
@@ -233,12 +234,22 @@ def check_output(
             raise InputError(f"{option} {path}: is an input of this command; name another file")
     if path.exists() and not force:
         raise InputError(f"{option} {path}: exists; name another file, or allow its replacement with --force")
+    if path.exists() and not _may_replace(path):
+        raise InputError(
+            f"{option} {path}: belongs to another user, and in {folder} only owners may replace files; name another"
+        )
     try:
         probe(path)
     except OSError as error:
         raise InputError(f"{option} {path}: cannot write there ({error.strerror})") from error
     promise(path, replace=force)
     return path
+
+
+def _may_replace(path: Path) -> bool:
+    """Whether a file may be replaced; in a sticky folder, such as /tmp, only its owner and the folder's may."""
+    folder = path.parent.stat()
+    return not folder.st_mode & stat.S_ISVTX or os.geteuid() in (0, folder.st_uid, path.lstat().st_uid)
 
 
 def announce(what: str, grain_steps: float, memory: float, backend: str, replicas: int = 1) -> dict[str, float]:

@@ -29,7 +29,7 @@ def report_command(
         report.add(file)
     text = report.page(Path(files[0]).name if len(files) == 1 else f"{Path(files[0]).name} and {len(files) - 1} more")
     with atomic(output) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")  # names may be any bytes
     megabytes = len(text) / 1e6
     log(f"wrote {output} ({megabytes:.1f} MB)")
     result = {"output": str(output), "megabytes": megabytes, "sections": [title for title, _ in report.sections]}

@@ -184,7 +184,7 @@ def _stop(store: Store, as_json: bool) -> None:
     ended, left = stop(store)
     for line in left:
         log(line, style="yellow")
-    told = [f"ended {one}" for one in ended] or ["nobody is at work here"]
+    told = [f"ended {one}" for one in ended] or ([] if left else ["nobody is at work here"])
     print_result(as_json, {"folder": str(store.folder), "ended": ended, "left": left}, *told)
     if left:
         raise RunFailedError(f"{plural(len(left), 'worker')} cannot be ended from here")

@@ -59,6 +59,14 @@ def remove_leftovers(folder: Path, name: str = "", *, age: float = 0.0) -> None:
                     drop(left)
 
 
+def remove_empty(folder: Path, pattern: str) -> None:
+    """Remove the files of these names that hold nothing."""
+    for path in folder.glob(pattern):
+        with contextlib.suppress(OSError):
+            if _plain(path) and not path.stat().st_size:
+                path.unlink()
+
+
 def promise(path: Path, *, replace: bool) -> None:
     """Say whether `place` may replace a file at `path`, an output of this process."""
     (_new.discard if replace else _new.add)(path.absolute())
@@ -125,8 +133,15 @@ class Folder:
     def __init__(self, path: Path, marker: str, schema: str, names: re.Pattern[str], about: dict[str, Any]) -> None:
         self.path, self._marker, self._schema, self._names = path, marker, schema, names
         if not self.is_there(path, marker, schema):
+            new = not path.exists()
             path.mkdir(exist_ok=True)
-            self.mark(about)
+            try:
+                self.mark(about)
+            except OSError:
+                if new:
+                    with contextlib.suppress(OSError):
+                        path.rmdir()
+                raise
 
     @classmethod
     def is_there(cls, path: Path, marker: str, schema: str) -> bool:

@@ -73,12 +73,17 @@ def _process(who: dict[str, Any], folder: Path) -> psutil.Process | None:
     """The process of a record, if it runs on this machine and has a file of this folder open.
 
     A folder that was copied, or made by another user, may hold records of processes that work elsewhere.
+
+    Raises:
+        psutil.AccessDenied: if it runs, and belongs to another user.
     """
     try:
         found = psutil.Process(int(who["pid"]))
         known = (who["host"], who["born"]) == (platform.node(), found.create_time())
         here = folder.resolve()
         return found if known and any(Path(one.path).is_relative_to(here) for one in found.open_files()) else None
+    except psutil.AccessDenied:
+        raise
     except (KeyError, TypeError, ValueError, OverflowError, psutil.Error):
         return None
 
@@ -113,7 +118,14 @@ def stop(store: Store) -> tuple[list[str], list[str]]:
             if number in queued and queued[number].name == who.get("name") == job_name(store, worker):
                 slurm.cancel(number)
                 ended.append(f"{worker}, job {number}")
-        elif found := _process(who, store.folder):
+            store.erase(worker)
+            continue
+        try:
+            found = _process(who, store.folder)
+        except psutil.AccessDenied:
+            left.append(f"{worker}, process {who['pid']}: belongs to another user, who can stop it")
+            continue
+        if found:
             end(found)
             ended.append(f"{worker}, process {found.pid}")
         elif who.get("host", platform.node()) != platform.node():

@@ -1,6 +1,7 @@
 """What a command may write to, and what it never destroys."""
 
 import json
+import os
 from dataclasses import fields
 from pathlib import Path
 
@@ -58,6 +59,18 @@ def test_not_even_by_force_is_an_input_overwritten(
     assert gmem(monkeypatch, "recall", own_pack, "-o", own_pack, "--force", *SHORT) == 2
     assert "is an input" in capsys.readouterr().err
     assert own_pack.read_bytes() == PACK.read_bytes()
+
+
+def test_another_user_s_file_in_a_sticky_folder_is_refused_before_the_work(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    output = tmp_path / "x.h5"
+    output.touch()
+    tmp_path.chmod(0o1777)
+    monkeypatch.setattr(os, "geteuid", lambda: 65534)
+    assert gmem(monkeypatch, "recall", PACK, "-o", output, "--force", *SHORT) == 2
+    assert "belongs to another user, and in" in capsys.readouterr().err
+    assert output.stat().st_size == 0
 
 
 def test_a_picture_that_is_there_counts_too(

@@ -85,6 +85,23 @@ def test_stop_ends_what_works_on_a_sweep_and_nobody_else(
     assert not psutil.pid_exists(sleeper.pid)
 
 
+def test_stop_leaves_the_record_of_a_worker_of_another_user(
+    sleeper: subprocess.Popen[bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    def denied(self: psutil.Process) -> Any:
+        raise psutil.AccessDenied(self.pid)
+
+    store = Store(tmp_path / "mu")
+    store.record("worker-0", known_by(sleeper.pid))
+    monkeypatch.setattr(psutil.Process, "open_files", denied)
+    assert gmem(monkeypatch, "sweep", "stop", tmp_path / "mu") == 1
+    said = capsys.readouterr()
+    assert f"worker-0, process {sleeper.pid}: belongs to another user, who can stop it" in said.err
+    assert said.out == ""
+    monkeypatch.undo()
+    assert stop(store) == ([f"worker-0, process {sleeper.pid}"], [])
+
+
 def test_stop_in_a_copy_of_a_sweep_ends_nobody_at_the_original(
     sleeper: subprocess.Popen[bytes], tmp_path: Path
 ) -> None:

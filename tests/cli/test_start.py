@@ -34,6 +34,14 @@ def said(*arguments: object, code: int, **environment: str | None) -> str:
     return done.stderr
 
 
+def test_letters_that_a_terminal_cannot_write_cut_no_result_off() -> None:
+    command = [*ENTRY, "show", "tetra-325-a"]
+    own = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    plain, ours = (subprocess.run(command, env=env, capture_output=True, timeout=300) for env in (own, None))
+    assert (plain.returncode, plain.stderr) == (0, b"")
+    assert len(plain.stdout.splitlines()) == len(ours.stdout.splitlines()) > 3
+
+
 @pytest.mark.parametrize("platform", ["cuda", "nonsense"])
 def test_a_jax_that_does_not_start_is_told_in_one_line_and_no_fault_of_the_pack(tmp_path: Path, platform: str) -> None:
     line = said("recall", PACK, "-o", tmp_path / "x.h5", *SHORT, code=2, JAX_PLATFORMS=platform)

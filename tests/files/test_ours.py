@@ -2,10 +2,12 @@
 
 import ast
 import contextlib
+import errno
 import os
 import re
 import stat
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,7 @@ from scenes import TETRA_27, gmem
 
 import gmem_jax as gm
 from gmem_jax.command.console import check_output
+from gmem_jax.files import compilation_cache
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.checkpoints import Checkpoints, locked
 from gmem_jax.files.ours import Folder, remove_leftovers, temporary
@@ -411,6 +414,27 @@ def test_a_pack_under_another_s_name_is_refused(tmp_path: Path, monkeypatch: pyt
     made.store.pack_at(job["name"]).write_bytes(PACK.read_bytes())
     with pytest.raises(gm.FileFormatError, match="files were exchanged"):
         made.pack_of({"mu": 0.1, "prepare.grains": 16})
+
+
+def test_programs_that_a_full_disk_left_empty_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, held in {"a-cache": b"", "b-cache": b"some", "b-atime": b""}.items():
+        (tmp_path / name).write_bytes(held)
+    monkeypatch.setenv("GMEM_COMPILE_CACHE", str(tmp_path))
+    monkeypatch.setattr(compilation_cache, "jax", SimpleNamespace(config=SimpleNamespace(update=lambda *_: None)))
+    compilation_cache.keep_programs()
+    assert {path.name for path in tmp_path.iterdir()} == {"b-cache", "b-atime"}
+
+
+def test_a_folder_that_cannot_be_marked_is_not_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Folder, "mark", full)
+    (tmp_path / "there").mkdir()
+    for name in ("new", "there"):
+        with pytest.raises(OSError, match="No space left"):
+            Folder(tmp_path / name, "mark.json", "own/1", re.compile("x"), {})
+    assert [path.name for path in tmp_path.iterdir()] == ["there"]
 
 
 def test_a_cache_of_a_relative_path_is_ignored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
