@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gmem_jax.files.atomic import probe
-from gmem_jax.files.ours import promise
+from gmem_jax.files.ours import WRITTEN, promise, remove_leftovers
 from gmem_jax.files.printing import finite, printable
 
 if TYPE_CHECKING:  # modules that import JAX are imported where they are used: `gmem --help` needs none
@@ -242,6 +242,7 @@ def check_output(
         probe(path)
     except OSError as error:
         raise InputError(f"{option} {path}: cannot write there ({error.strerror})") from error
+    remove_leftovers(folder, path.name, age=WRITTEN)
     promise(path, replace=force)
     return path
 

@@ -19,6 +19,7 @@ from typing import Any
 from gmem_jax.errors import FileFormatError
 
 _TEMPORARY = re.compile(r"\.gmem-([0-9a-f]{12})-[0-9a-f]{12}\.tmp")
+WRITTEN = 3600.0  # s after which a temporary file was left by a killed writer: others may be writing younger ones
 _new: set[Path] = set()  # outputs that were free when a command claimed them
 
 

@@ -22,7 +22,7 @@ from gmem_jax.errors import FileFormatError
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.checkpoints import PART_FILES, is_locked, locked
-from gmem_jax.files.ours import Folder, remove_leftovers
+from gmem_jax.files.ours import WRITTEN, Folder, remove_leftovers
 from gmem_jax.files.printing import printable
 from gmem_jax.files.recalls import load_recall, save_recall
 from gmem_jax.files.schemas import SWEEP
@@ -31,7 +31,6 @@ from gmem_jax.sweeps.plan import Point
 
 SWEEP_MARKER = "sweep.json"
 FREE_BYTES = 1 << 20  # bytes that must be free on the disk: some points of a small pack
-WRITTEN = 3600.0  # s after which a temporary file was left by a killed writer: workers may be writing younger ones
 JOB = "job.json"  # the file of a job beside its parts, while other jobs are in jobs/
 FOLDERS = ("jobs", "points", "failed", "packs", "parts", "workers")
 _KEY = r"[0-9a-z]{1,40}"

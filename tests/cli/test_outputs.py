@@ -13,6 +13,7 @@ from test_cli import PACK, SHORT
 import gmem_jax as gm
 from gmem_jax import native
 from gmem_jax.command import packs, recalls
+from gmem_jax.files.ours import temporary
 from gmem_jax.files.results import finite
 from gmem_jax.files.waveforms import load_target
 from gmem_jax.show import tables
@@ -59,6 +60,17 @@ def test_not_even_by_force_is_an_input_overwritten(
     assert gmem(monkeypatch, "recall", own_pack, "-o", own_pack, "--force", *SHORT) == 2
     assert "is an input" in capsys.readouterr().err
     assert own_pack.read_bytes() == PACK.read_bytes()
+
+
+def test_what_a_killed_writer_of_an_output_left_is_removed_by_the_next(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    output = tmp_path / "a.xyz"
+    old, young, other = temporary(output), temporary(output), temporary(tmp_path / "b.xyz")
+    for left in (old, other):
+        os.utime(left, (0.0, 0.0))
+    assert gmem(monkeypatch, "export", PACK, "--to", "xyz", "-o", output) == 0
+    assert set(tmp_path.iterdir()) == {output, young, other}
 
 
 def test_another_user_s_file_in_a_sticky_folder_is_refused_before_the_work(
