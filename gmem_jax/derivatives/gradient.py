@@ -26,6 +26,7 @@ from gmem_jax.derivatives.moving import (
     state_of,
     theta_of,
     whole_work,
+    with_grain,
     with_numbers,
 )
 from gmem_jax.experiment.arguments import require_kind
@@ -220,8 +221,7 @@ def value_and_grad(
     require_derivatives(experiment)
     tell = callback(progress)
     theta = theta_of(experiment, by)
-    if of_grain := {name: part for name, part in theta.items() if name.startswith("pack.clump")}:
-        experiment = with_values(experiment, of_grain)  # whose grain may have three moments of inertia now
+    experiment = with_grain(experiment, theta)
     along = functools.partial(with_values, experiment)
     common, own = experiment.phases
     on = runner_of(experiment, progress=within(tell, 0.0, FORWARDS))

@@ -111,6 +111,12 @@ def theta_of(experiment: Experiment, names: Any) -> dict[str, Any]:
     return theta
 
 
+def with_grain(experiment: Experiment, theta: dict[str, Any]) -> Experiment:
+    """The experiment, with a grain of three moments of inertia if they are among the parts `theta`."""
+    of_grain = {name: part for name, part in theta.items() if name.startswith("pack.clump")}
+    return with_values(experiment, of_grain) if of_grain else experiment
+
+
 def _is_number(leaf: Any) -> bool:
     return isinstance(leaf, float | int | np.ndarray | jax.Array)
 

@@ -18,6 +18,7 @@ from gmem_jax.derivatives.moving import (
     state_of,
     theta_of,
     whole_work,
+    with_grain,
     with_numbers,
 )
 from gmem_jax.experiment.changes import replace as with_values
@@ -127,6 +128,7 @@ def push(experiment: Experiment, direction: Mapping[str, Any], *, progress: Prog
     """
     require_derivatives(experiment)
     theta, tangent = theta_of(experiment, direction), jax.tree.map(jnp.asarray, dict(direction))
+    experiment = with_grain(experiment, theta)
     common, own = experiment.phases
     on = runner_of(experiment, progress=progress)
     on.total_work = whole_work(experiment, on)
