@@ -130,9 +130,11 @@ def heading(name: str, scale: str) -> list[str]:
 
 def verdicts(path: Path) -> list[str]:
     """What was found of the claims as Markdown."""
-    lines = ["| claim | holds | numbers |", "|---|---|---|"]
-    for verdict in json.loads(path.read_text()):
-        lines.append(f"| {verdict['claim']} | {'yes' if verdict['holds'] else 'no'} | {verdict['numbers']} |")
+    found, answers = json.loads(path.read_text()), {True: "yes", False: "no", None: "cannot be told"}
+    lines = [f"One pack, {found[0]['pack']}.", "", "| claim | holds | numbers |", "|---|---|---|"]
+    for verdict in found:
+        why = f"; {verdict['why']}" if verdict["why"] else ""
+        lines.append(f"| {verdict['claim']} | {answers[verdict['holds']]}{why} | {verdict['numbers']} |")
     return lines
 
 
