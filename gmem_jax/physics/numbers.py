@@ -32,26 +32,16 @@ def said(value: Any) -> str:
 
 
 def require_numbers(**values: Any) -> None:
-    """Refuse values that are not single real numbers; None, which stands for a default, is accepted.
+    """Refuse tracers, and values that are not single real numbers; None, which stands for a default, is accepted.
 
     Raises:
         ValueError: naming the first such value, and what was given.
     """
     for name, value in values.items():
-        if value is not None and not (is_real(value) and np.ndim(value) == 0):
-            raise ValueError(f"{name} must be a number, got {said(value)}")
-
-
-def require_static(**values: Any) -> None:
-    """Refuse tracers of JAX, and what `require_numbers` refuses.
-
-    Raises:
-        ValueError: naming the first such value.
-    """
-    for name, value in values.items():
         if isinstance(value, jax.core.Tracer):
             raise ValueError(f"{name} is fixed when a program is compiled: it must be a number, not traced")
-    require_numbers(**values)
+        if value is not None and not (is_real(value) and np.ndim(value) == 0):
+            raise ValueError(f"{name} must be a number, got {said(value)}")
 
 
 def require_whole(name: str, value: Any, least: int = 0) -> int:

@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import jax
 import numpy as np
 
-from gmem_jax.physics.numbers import require_numbers, require_static, said
+from gmem_jax.physics.numbers import require_numbers, said
 from gmem_jax.physics.pytree import static_record
 from gmem_jax.simulation.channels import CHANNELS
 
@@ -104,7 +104,7 @@ class Drive:
             raise ValueError(f"a sine has whole periods, as in 'sine:4'; got {self.waveform!r}")
         if self.fixed and not self.channel:
             raise ValueError("a fixed waveform needs a channel, as in channel='xy'")
-        require_static(**{"the amplitude of a drive": self.amplitude})
+        require_numbers(**{"the amplitude of a drive": self.amplitude})
         if not math.isfinite(self.amplitude):
             raise ValueError(f"the amplitude of a drive must be a finite number, got {self.amplitude!r}")
         object.__setattr__(self, "amplitude", float(self.amplitude))
@@ -214,8 +214,8 @@ class Stage:
             refuse(f"along must be one of {', '.join(get_args(Along))}; got {self.along!r}")
         pressure: tuple[Any, ...] = tuple(self.pressure) if np.iterable(self.pressure) else (self.pressure,)
         try:
-            require_static(start=self.start, stop=self.stop, length=self.length, drag=self.drag)
-            require_static(**dict(zip(("pressure along x", "along y", "along z"), pressure, strict=False)))
+            require_numbers(start=self.start, stop=self.stop, length=self.length, drag=self.drag)
+            require_numbers(**dict(zip(("pressure along x", "along y", "along z"), pressure, strict=False)))
         except ValueError as error:
             refuse(f"its {error}")
         for name in ("start", "stop"):

@@ -393,6 +393,12 @@ def test_a_concrete_waveform_inside_jit_is_a_waveform_like_any_other() -> None:
     assert np.isfinite(float(found))
 
 
+@pytest.mark.parametrize("make", [gm.rest, gm.tetra, lambda x: gm.words(2, width=x)], ids=["rest", "tetra", "words"])
+def test_what_a_program_is_compiled_for_may_not_be_traced(make: Any) -> None:
+    with pytest.raises(ValueError, match="is fixed when a program is compiled: it must be a number, not traced"):
+        jax.jit(lambda x: jnp.asarray(0.0 * (make(x) is None)))(0.5)
+
+
 def test_the_host_refuses_what_is_traced_and_says_what_to_use() -> None:
     experiment = make()
     with pytest.raises(ValueError, match=r"use gm.recall"):
