@@ -53,8 +53,8 @@ def reproduce_command(
     """Run a figure of the paper again, beside the published points.
 
     Says what it will cost, resumes, and computes no point twice, whichever figures need it. Writes NAME-SCALE.png,
-    .svg and .csv, each of our points beside the published one. dataset is not of all: the recalls of the figures as
-    one archive, dataset-SCALE.zip.
+    .svg and .csv, each of our points beside the published one; claims writes claims-SCALE.json. all leaves dataset out,
+    which writes the recalls of the figures as one archive, dataset-SCALE.zip.
     """
     if what not in (*REPRODUCIBLE, "all"):
         raise InputError(f"reproduce {what}: no such figure; there are {', '.join(REPRODUCIBLE)} and all")
