@@ -54,6 +54,6 @@ def keep_programs() -> None:
     jax.config.update("jax_compilation_cache_dir", str(folder))
     # Keep small programs too: a recall has a hundred of them (0.5 MB), which are read faster than compiled.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    remove_empty(folder, "*-cache")  # programs that a full disk left empty: JAX would never write them again
+    remove_empty(folder, "-cache")  # programs that a full disk left empty: JAX would never write them again
     # Programs that a killed process left half written are compiled again.
     warnings.filterwarnings("ignore", message="Error (reading|writing) persistent compilation cache")

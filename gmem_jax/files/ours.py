@@ -60,12 +60,13 @@ def remove_leftovers(folder: Path, name: str = "", *, age: float = 0.0) -> None:
                     drop(left)
 
 
-def remove_empty(folder: Path, pattern: str) -> None:
-    """Remove the files of these names that hold nothing."""
-    for path in folder.glob(pattern):
-        with contextlib.suppress(OSError):
-            if _plain(path) and not path.stat().st_size:
-                path.unlink()
+def remove_empty(folder: Path, ending: str) -> None:
+    """Remove the files in a folder whose names end so and that hold nothing."""
+    with os.scandir(folder) as entries:  # a folder may have thousands, and each command looks
+        for entry in entries:
+            with contextlib.suppress(OSError):
+                if entry.name.endswith(ending) and entry.is_file(follow_symlinks=False) and not entry.stat().st_size:
+                    os.unlink(entry)
 
 
 def promise(path: Path, *, replace: bool) -> None:

@@ -118,19 +118,18 @@ def stop(store: Store) -> tuple[list[str], list[str]]:
             if number in queued and queued[number].name == who.get("name") == job_name(store, worker):
                 slurm.cancel(number)
                 ended.append(f"{worker}, job {number}")
-            store.erase(worker)
-            continue
-        try:
-            found = _process(who, store.folder)
-        except psutil.AccessDenied:
-            left.append(f"{worker}, process {who['pid']}: belongs to another user, who can stop it")
-            continue
-        if found:
-            end(found)
-            ended.append(f"{worker}, process {found.pid}")
-        elif who.get("host", platform.node()) != platform.node():
-            left.append(f"{worker}: was started on {who['host']}; stop it there")
-            continue
+        else:
+            try:
+                found = _process(who, store.folder)
+            except psutil.AccessDenied:
+                left.append(f"{worker}, process {who['pid']}: belongs to another user, who can stop it")
+                continue
+            if found:
+                end(found)
+                ended.append(f"{worker}, process {found.pid}")
+            elif who.get("host", platform.node()) != platform.node():
+                left.append(f"{worker}: was started on {who['host']}; stop it there")
+                continue
         store.erase(worker)
     return ended, left
 
