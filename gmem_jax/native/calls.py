@@ -229,7 +229,7 @@ def make_primitive(
         target: name of the call in XLA.
         outputs: function from the arguments to the shapes of the results.
         plain: the call in plain JAX, a function of the definition and the arguments; default the definition itself.
-        in_place: whether histories are updated in their own memory.
+        in_place: whether fields and histories are updated in their own memory.
         make: makes the call of the library, with the arguments of `call_library`.
     """
     primitive = Primitive(target)

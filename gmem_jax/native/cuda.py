@@ -204,19 +204,21 @@ def between_steps(
 
 
 def aliases_of(before: Sequence[Any], arrays: Any, results: Sequence[Any]) -> dict[int, int]:
-    """The histories that a call updates in their own memory, since they are by far the largest of its arrays.
+    """The fields of the grains and the histories, which a call updates in their own memory.
 
     Args:
-        before: the arguments before the histories.
+        before: the arguments before the histories; the fields are the first of them.
         arrays: the arguments with respect to which a call can be differentiated.
         results: the shapes of the results.
 
     Returns:
         For the number of an argument, the number of the result that takes its memory.
     """
-    places = ((len(before) + number, len(arrays.fields) + 1 + number) for number in range(len(arrays.history)))
-    histories = zip(places, arrays.history, strict=True)
-    return {argument: result for (argument, result), leaf in histories if leaf.shape == results[result].shape}
+    fields, histories = len(arrays.fields), len(arrays.history)
+    places = [*range(fields), *range(len(before), len(before) + histories)]
+    numbers = [*range(fields), *range(fields + 1, fields + 1 + histories)]  # between them is the pressure
+    found = zip(places, numbers, (*arrays.fields, *arrays.history), strict=True)
+    return {argument: result for argument, result, leaf in found if leaf.shape == results[result].shape}
 
 
 def call_kernels(target: str, call: Any, in_place: bool, parts: Any, shapes: Sequence[Any]) -> Sequence[jax.Array]:
@@ -225,7 +227,7 @@ def call_kernels(target: str, call: Any, in_place: bool, parts: Any, shapes: Seq
     Args:
         target: name of the call in XLA.
         call: attributes of the call, `gmem_jax.native.calls.Call`.
-        in_place: whether new histories may overwrite those that were given.
+        in_place: whether new fields and histories may overwrite those that were given.
         parts: `Fixed` and `Arrays` of `gmem_jax.native.calls`; then the `Arrays` of the tangent or, for reverse mode,
             a `StepOutput`.
         shapes: shapes of the results.

@@ -274,7 +274,7 @@ def rollout_chunk(
     def one(place: jax.Array, carry: tuple[State, Any]) -> tuple[State, Any]:
         state, kept = carry
         state, new = step(state, place)
-        return state, jax.tree.map(lambda all_, leaf: all_.at[place].set(leaf), kept, new)
+        return state, jax.tree.map(lambda all_, leaf: lax.dynamic_update_index_in_dim(all_, leaf, place, 0), kept, new)
 
     shape = jax.eval_shape(lambda: step(state, 0)[1])
     blank = jax.tree.map(lambda leaf: jnp.zeros((most, *leaf.shape), leaf.dtype), shape)
