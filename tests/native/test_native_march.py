@@ -6,6 +6,7 @@ fastest grain could have brought them together.
 """
 
 import functools
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -94,6 +95,25 @@ def test_spinning_sliding_grains_of_several_domains_move_as_defined(law: str, re
     assert_close(fast.grains, plain.grains, 1e-11)
     assert_close(fast.history, plain.history, 1e-11)
     assert_close(pressure, expected, 1e-11)
+
+
+def test_calls_after_calls_move_grains_in_their_own_memory_and_leave_what_they_were_given() -> None:
+    system, state = thrown("H")
+
+    def three(state: State) -> State:
+        box = walls(0, 2)
+        moved: State = jax.lax.fori_loop(0, 3, lambda _, now: native.march(system, now, box, DT, 0.0)[0], state)
+        return moved
+
+    compiled = jax.jit(three).lower(state).compile()
+    # One copy of each of the six fields, before the first call: the caller may need what was given again.
+    assert len(re.findall(rf"f64\[{PACK.grains},[34],{REPLICAS}\]\S* copy\(", compiled.as_text())) == 6
+    given = [np.array(leaf) for leaf in jax.tree.leaves(state)]
+    ends = [jax.tree.leaves(compiled(state)) for _ in range(2)]
+    for once, again in zip(*ends, strict=True):
+        np.testing.assert_array_equal(once, again)
+    for before, now in zip(given, jax.tree.leaves(state), strict=True):
+        np.testing.assert_array_equal(before, now)
 
 
 def end(march: Any, system: System, state: State, theta: dict[str, Any]) -> Any:
