@@ -107,7 +107,7 @@ def test_calls_after_calls_move_grains_in_their_own_memory_and_leave_what_they_w
 
     compiled = jax.jit(three).lower(state).compile()
     # One copy of each of the six fields, before the first call: the caller may need what was given again.
-    assert len(re.findall(rf"f64\[{PACK.grains},[34],{REPLICAS}\]\S* copy\(", compiled.as_text())) == 6
+    assert len(re.findall(rf"f64\[{PACK.grains},[34],{REPLICAS}\]\S* copy\(", compiled.as_text() or "")) == 6
     given = [np.array(leaf) for leaf in jax.tree.leaves(state)]
     ends = [jax.tree.leaves(compiled(state)) for _ in range(2)]
     for once, again in zip(*ends, strict=True):
