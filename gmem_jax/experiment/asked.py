@@ -55,22 +55,6 @@ def require_data(**parts: Any) -> None:
                 )
 
 
-def require_double(**parts: Any) -> None:
-    """Refuse arrays in less than double precision: those that were made before JAX's 64-bit mode was on.
-
-    Raises:
-        ValueError: naming the first such array.
-    """
-    for name, part in parts.items():
-        for path, leaf in jax.tree_util.tree_leaves_with_path(part):
-            kind = getattr(leaf, "dtype", np.dtype(float))
-            if jnp.issubdtype(kind, jnp.floating) and kind.itemsize < 8:
-                raise ValueError(
-                    f"{name}{jax.tree_util.keystr(path)} is {kind}, and float64 is needed: make or load the {name} "
-                    'after jax.config.update("jax_enable_x64", True)'
-                )
-
-
 def require_host(what: str, experiment: Any) -> None:
     """Refuse the function `what`, which works on the host, if the experiment is traced or inside `jax.jit`.
 

@@ -15,7 +15,6 @@ from gmem_jax.experiment.analysis import Background
 from gmem_jax.experiment.arguments import named_observers, require_parts
 from gmem_jax.experiment.asked import (
     require_data,
-    require_double,
     require_finite_waveforms,
     require_memory,
     require_pack,
@@ -37,7 +36,7 @@ from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.contact.own_law import require_law
 from gmem_jax.physics.material import Material
-from gmem_jax.physics.numbers import require_whole
+from gmem_jax.physics.numbers import require_double, require_whole
 from gmem_jax.physics.pytree import Scalar, out_of_range, parameter, pytree, static, traced, validate
 from gmem_jax.physics.rotation import unit
 from gmem_jax.physics.rules import usual_rules

@@ -1,7 +1,7 @@
 """Prepared packs: grains at rest in their box, the start of every experiment."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 from gmem_jax.experiment.html import Facts, brief, facts, line
 from gmem_jax.physics.boundary import WALLS, PeriodicAxes, boundary_of
 from gmem_jax.physics.grain import Clump, words_of_sizes
-from gmem_jax.physics.numbers import said
+from gmem_jax.physics.numbers import plural, require_double, said
 from gmem_jax.physics.pairs import Pairs, listed_candidates, tabulate
 from gmem_jax.physics.pytree import label, pytree, static
 from gmem_jax.physics.rotation import unit
@@ -141,13 +141,14 @@ def stack(packs: Sequence[Pack]) -> Pack:
     """Stack packs into one `Pack` whose arrays have a leading axis, for `jax.vmap`.
 
     Args:
-        packs: packs with the same number of grains, shape of grain and boundary.
+        packs: packs with the same number of grains, shape of grain and boundary. If one grain is not isotropic, none of
+            the stack counts as isotropic.
 
     Raises:
-        ValueError: if there is no pack, or they differ in one of these.
+        ValueError: if there is no pack, they differ in one of these, or one is not in double precision.
     """
-    if isinstance(packs, Pack):
-        raise ValueError(f"stack takes several packs, in a list: got {packs.name}")
+    if isinstance(packs, Pack) or not isinstance(packs, Iterable):
+        raise ValueError(f"stack takes several packs, in a list: got {said(packs)}")
     packs = tuple(packs)
     if not packs:
         raise ValueError("stack needs at least one pack")
@@ -157,11 +158,11 @@ def stack(packs: Sequence[Pack]) -> Pack:
             raise ValueError(f"stack takes packs, got {said(pack)}")
         if np.ndim(pack.position) != 2:
             raise ValueError(f"stack takes single packs; {pack.name} is a stack already")
+        require_double(pack=pack)
     for pack in packs[1:]:
-        if pack.grains != first.grains or pack.clump.shape != first.clump.shape:
+        if (own := _size_and_grain(pack)) != (its := _size_and_grain(first)):
             raise ValueError(
-                f"packs to be stacked must have one size and grain: {first.name} has {first.grains} "
-                f"{first.clump.shape}, {pack.name} has {pack.grains} {pack.clump.shape}"
+                f"packs to be stacked must have one size and grain: {first.name} has {its}, {pack.name} has {own}"
             )
         if any((one is None) != (other is None) for one, other in zip(*map(_unequal, (first, pack)), strict=True)):
             raise ValueError(f"either all packs of a stack have sizes, or none: {first.name} and {pack.name} differ")
@@ -173,9 +174,23 @@ def stack(packs: Sequence[Pack]) -> Pack:
     capacity = max(pack.pairs.capacity for pack in packs)
     per_sphere = max(pack.pairs.incidence.shape[-1] for pack in packs)
     name = "+".join(pack.name for pack in packs)
-    padded = [replace(pack, pairs=_widen(pack, capacity, per_sphere), name=name, record="{}") for pack in packs]
+    isotropic = all(pack.clump.isotropic for pack in packs)
+    padded = [
+        replace(
+            pack,
+            clump=replace(pack.clump, isotropic=isotropic),
+            pairs=_widen(pack, capacity, per_sphere),
+            name=name,
+            record="{}",
+        )
+        for pack in packs
+    ]
     stacked: Pack = jax.tree.map(lambda *leaves: jnp.stack(leaves), *padded)
     return stacked
+
+
+def _size_and_grain(pack: Pack) -> str:
+    return f"{pack.grains} {pack.clump.shape} of {plural(pack.clump.spheres, 'sphere')}"
 
 
 def _unequal(pack: Pack) -> tuple[jax.Array | None, jax.Array | None]:

@@ -13,12 +13,11 @@ import numpy as np
 
 from gmem_jax.experiment import html
 from gmem_jax.experiment.arguments import require_kind
-from gmem_jax.experiment.asked import require_double
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.readings import rates_of
 from gmem_jax.experiment.record import describe
 from gmem_jax.experiment.validity import compression_speed, readable, rounding, validity
-from gmem_jax.physics.numbers import plural
+from gmem_jax.physics.numbers import plural, require_double
 from gmem_jax.physics.pytree import Scalar, label, pytree, static, traced
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import WARNINGS, State, Status, combined_status, explain, replicate
@@ -281,11 +280,12 @@ def gain(experiment: Experiment) -> jax.Array:
 def with_waveforms(experiment: Experiment, before: Simulation, state: State) -> Simulation:
     """The simulation after the prefix, with waveforms, for a state of all replicas; `before` is that of the prefix.
 
-    Observers compare with the end of the prefix if the protocol marks no stage.
+    Observers compare with the end of the prefix if the protocol marks no stage. Without a prefix that is the beginning,
+    with which they compare up to the first stage that is marked.
     """
     simulation, own = experiment.simulation(sheared=True), experiment.phases[1]
-    if not any(stage.mark for stage in experiment.protocol):
-        return simulation.marked(state, own[0])
     mark = before.mark
-    narrow = mark is not None and mark.touching.shape[-1] == 1 < state.replicas
+    if mark is None or not any(stage.mark for stage in experiment.protocol):
+        return simulation.marked(state, own[0])
+    narrow = mark.touching.shape[-1] == 1 < state.replicas
     return dataclasses.replace(simulation, mark=replicate(mark, state.replicas) if narrow else mark)

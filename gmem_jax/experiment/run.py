@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment.arguments import require_kind, require_several
-from gmem_jax.experiment.asked import require_double, require_host, require_inside
+from gmem_jax.experiment.asked import require_host, require_inside
 from gmem_jax.experiment.changes import with_part
 from gmem_jax.experiment.experiment import Experiment, replica_parameters
 from gmem_jax.experiment.identity import identity
@@ -19,7 +19,7 @@ from gmem_jax.experiment.pack_warnings import warn_of_another_preparation
 from gmem_jax.experiment.recall import Recall, judged, unjudged, with_waveforms
 from gmem_jax.experiment.record import describe
 from gmem_jax.experiment.stepping import require_stable
-from gmem_jax.physics.numbers import require_whole
+from gmem_jax.physics.numbers import require_double, require_whole
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache, no_cache
 from gmem_jax.simulation.compiled import Compiled, require_x64

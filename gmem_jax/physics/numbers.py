@@ -1,4 +1,4 @@
-"""Checks that arguments are real numbers, and numbers and counts in words."""
+"""Checks that arguments are real numbers in double precision, and numbers and counts in words."""
 
 import operator
 from decimal import Decimal
@@ -42,6 +42,22 @@ def require_numbers(**values: Any) -> None:
             raise ValueError(f"{name} is fixed when a program is compiled: it must be a number, not traced")
         if value is not None and not (is_real(value) and np.ndim(value) == 0):
             raise ValueError(f"{name} must be a number, got {said(value)}")
+
+
+def require_double(**parts: Any) -> None:
+    """Refuse arrays in less than double precision: those that were made before JAX's 64-bit mode was on.
+
+    Raises:
+        ValueError: naming the first such array.
+    """
+    for name, part in parts.items():
+        for path, leaf in jax.tree_util.tree_leaves_with_path(part):
+            kind = getattr(leaf, "dtype", np.dtype(float))
+            if jnp.issubdtype(kind, jnp.floating) and kind.itemsize < 8:
+                raise ValueError(
+                    f"{name}{jax.tree_util.keystr(path)} is {kind}, and float64 is needed: make or load the {name} "
+                    'after jax.config.update("jax_enable_x64", True)'
+                )
 
 
 def require_whole(name: str, value: Any, least: int = 0) -> int:

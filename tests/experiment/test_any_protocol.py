@@ -287,6 +287,9 @@ def test_observers_see_every_bin_and_change_nothing() -> None:
     np.testing.assert_allclose(
         batches.stages["read"].observed["moved"], late.stages["read"].observed["moved"], rtol=1e-9
     )
+    at_once = gm.recall(experiment(marked, observe={"moved": moved}))  # there is no prefix that could have a mark
+    for name, sample in at_once.stages.items():
+        np.testing.assert_allclose(sample.observed["moved"], late.stages[name].observed["moved"], rtol=1e-6)
 
 
 def test_observers_do_not_disturb_derivatives() -> None:

@@ -103,6 +103,27 @@ def test_stacking_packs_of_different_sizes_is_refused(pack: gm.Pack) -> None:
     other = gm.pack_from(pack, position=pack.position[:-1], quaternion=pack.quaternion[:-1])
     with pytest.raises(ValueError, match="one size"):
         gm.stack([pack, other])
+    pair, triple = (gm.clump(np.eye(3)[:count]) for count in (2, 3))
+    two, three = (
+        gm.pack_from(dataclasses.replace(pack, clump=grain), position=pack.position, quaternion=pack.quaternion)
+        for grain in (pair, triple)
+    )
+    with pytest.raises(ValueError, match=r"has 27 clump of 2 spheres, .* has 27 clump of 3 spheres"):
+        gm.stack([two, three])
+
+
+def test_what_cannot_be_stacked_is_named(pack: gm.Pack) -> None:
+    with pytest.raises(ValueError, match="stack takes several packs, in a list: got None"):
+        gm.stack(None)  # type: ignore[arg-type]
+    rough = dataclasses.replace(pack, position=pack.position.astype(jnp.float32))
+    with pytest.raises(ValueError, match=r"pack\.position is float32, and float64 is needed"):
+        gm.stack([pack, rough])
+
+
+def test_a_stack_is_isotropic_only_if_all_its_grains_are(pack: gm.Pack) -> None:
+    other = dataclasses.replace(pack, clump=dataclasses.replace(pack.clump, isotropic=False))
+    assert gm.stack([pack, pack]).clump.isotropic
+    assert not gm.stack([pack, other]).clump.isotropic
 
 
 def test_33_replicas_of_all_stages_run_in_one_compiled_program(pack: gm.Pack) -> None:
