@@ -104,7 +104,7 @@ def classify_command(
     except ValueError as error:
         raise InputError(f"{recall}: {error}; make one with gmem recall --signals words:L") from error
     check_output(output, ".json", inputs=(recall,), force=force)
-    drawn = check_output(output.with_suffix(".png"), ".png", force=force) if picture else None
+    drawn = check_output(output.with_suffix(".png"), ".png", inputs=(recall,), force=force) if picture else None
     folder = recall.parent / "gmem-nets" if nets is None else nets
     try:
         folder.mkdir(parents=True, exist_ok=True)

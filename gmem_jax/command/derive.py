@@ -288,13 +288,12 @@ def design_command(
     _require_designable(experiment)
     if chosen.target(experiment.signals.count) is not None:
         raise InputError("--signals: these are designed waveforms; give the wanted ones, and these as --start to go on")
-    if start is not None:
-        if not start.is_file():
-            raise InputError(f"--start {start}: is no file of waveforms")
-        check_output(output, ".csv", inputs=(start,), force=force)
-    history = output.with_name(f"{output.stem}-history.png")
-    if picture:
-        check_output(history, ".png", force=force)
+    if start is not None and not start.is_file():
+        raise InputError(f"--start {start}: is no file of waveforms")
+    history, given = output.with_name(f"{output.stem}-history.png"), (pack,) if start is None else (pack, start)
+    check_output(output, ".csv", inputs=given, force=force)
+    for path in (drawn, history) if drawn else ():
+        check_output(path, ".png", inputs=given, force=force)
     began = time.perf_counter()
     count = experiment.signals.count
     by = by or ("kernel" if words is not None or count > MANY else "jacobian")

@@ -63,17 +63,17 @@ def reproduce_command(
     except ValueError as error:
         raise InputError(f"--scale {scale}: {error}") from None
     options = _options(option or [])
+    check_folder(output)
     if dry_run:
         require_options(executor, options)
         _say_cost(what, scale, output, workers or 1, as_json)
         return
     executor_named(executor, workers, options)  # refuses an impossible executor before anything is written
-    check_folder(output)
     output.mkdir(exist_ok=True)
     outcomes, tested, drawn = [], None, []
-    weighed: Outcome[Effect] = Outcome("choices", [], [], [])
+    weighed: Outcome[Effect] = Outcome("choices", [], [], {})
     archives: list[Path] = []
-    broken: list[str] = []
+    broken: dict[str, str] = {}
     statuses: list[int] = []
 
     def wanted(names: Iterable[str]) -> list[str]:
@@ -82,7 +82,8 @@ def reproduce_command(
     def reproduction(progress: Progress) -> Reproduction:
         return Reproduction(output, scale, executor_named(executor, workers, options), progress, log, statuses)
 
-    with locked(output / "figures"):
+    with locked(output / "figures", f"{output}: another run is writing it; call again when it has ended"):
+        _require_ours(output, wanted(REPRODUCIBLE))
         if retry and (count := Store(output / RUNS).clear_failures()):
             log(f"trying what failed again: {count} of the points and packs")
         for name in wanted((GALLERY, *SCHEMATICS)):
@@ -119,9 +120,26 @@ def reproduce_command(
     lines = _claims_lines(tested) if tested else []
     more = [_choices_table(weighed.rows)] if weighed.rows else []
     print_result(as_json, result, *lines, *more, *map(_table, outcomes))
-    broken += weighed.failed + [reason for outcome in outcomes for reason in outcome.failed]
+    broken |= weighed.failed
+    for outcome in outcomes:
+        broken |= outcome.failed
     if broken:
         raise RunFailedError(f"{len(broken)} of the points and packs failed; try them again with --retry")
+
+
+def _require_ours(output: Path, names: Iterable[str]) -> None:
+    """Mark a folder as one of ours; refuse it if it is not and has files with the names of figures.
+
+    Raises:
+        InputError: naming such a file.
+        FileFormatError: if the runs of the folder are something else.
+    """
+    if not (output / RUNS).exists():
+        for taken in (path for name in names for path in output.glob(f"{name}[-.]*")):
+            raise InputError(f"{taken}: is not of this command, and would be replaced; move it away, or use --output")
+    if (nets := output / "nets").exists() and not nets.is_dir():
+        raise InputError(f"{nets}: is a file, and a folder is needed; move it away")
+    Store(output / RUNS)
 
 
 def _say_cost(what: str, scale: str, output: Path, workers: int, as_json: bool) -> None:
@@ -138,12 +156,12 @@ def _say_cost(what: str, scale: str, output: Path, workers: int, as_json: bool) 
 
 
 @contextlib.contextmanager
-def _going_on(broken: list[str]) -> Iterator[None]:
+def _going_on(broken: dict[str, str]) -> Iterator[None]:
     """Report a run that fails in the block, and go on."""
     try:
         yield
     except RunFailedError as error:
-        broken.append(str(error))
+        broken[str(error)] = str(error)
         log(f"failed: {error}", style="yellow")
 
 
@@ -179,7 +197,7 @@ def _claims_lines(tested: Claims) -> list[str]:
 
 
 def _say_written(done: Outcome[Any]) -> None:
-    for reason in sorted(set(done.failed)):
+    for reason in sorted(set(done.failed.values())):
         log(f"failed: {reason}", style="yellow")
     if done.files:
         log(f"wrote {', '.join(map(str, done.files))}")

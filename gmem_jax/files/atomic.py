@@ -29,7 +29,7 @@ def atomic(path: Path, *, flush: bool = True) -> Iterator[Path]:
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path}: folder {path.parent} does not exist")
     if path.is_dir():
-        raise IsADirectoryError(f"{path}: is a folder; name a file")
+        raise IsADirectoryError(f"{path}: is a folder, and a file is needed; move it away, or name another")
     try:
         made = temporary(path)
         yield made

@@ -80,7 +80,10 @@ def write_dataset(
         example=points[0].key,
         measure=f"G and F of points.csv are {averaged}. Versions: {json.dumps(versions())}.",
     )
-    with atomic(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
+    with (
+        atomic(path) as temporary,
+        zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, strict_timestamps=False) as archive,
+    ):
         archive.writestr("README.md", told)
         archive.writestr("points.csv", table.getvalue())
         for point in points:

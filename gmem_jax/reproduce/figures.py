@@ -67,13 +67,16 @@ def scale_of(text: str, scales: Mapping[str, Scale] = SCALES) -> Scale:
     name, *changes = text.split(",")
     if name not in scales:
         raise ValueError(f"no scale {name!r}; there are {', '.join(scales)}")
-    found, known = scales[name], [field.name for field in fields(Scale)]
+    found, known, given = scales[name], [field.name for field in fields(Scale)], set()
     for change in changes:
         field, _, value = change.partition("=")
         if field not in known:
             raise ValueError(
                 f"a scale has no field to set by {change!r}; it has {', '.join(known)}, as in {name},packs=1"
             )
+        if field in given:
+            raise ValueError(f"{field} is given twice")
+        given.add(field)
         was = getattr(found, field)
         wanted: Any
         try:

@@ -95,13 +95,13 @@ class Outcome(NamedTuple, Generic[_Row]):
         name: name of the figure, or "choices".
         rows: the measures of a figure beside the published ones, or the effects of every value of every choice.
         files: the files written.
-        failed: reasons of points that failed.
+        failed: reasons of points that failed, by key.
     """
 
     name: str
     rows: list[_Row]
     files: list[Path]
-    failed: list[str]
+    failed: dict[str, str]
 
 
 class Claims(NamedTuple):
@@ -207,11 +207,11 @@ class Reproduction:
         choices.draw(target, found, choices.choices_title(size, found[0].gain.packs))
         return Outcome("choices", found, _written(target), _failed(store))
 
-    def dataset(self) -> tuple[list[Path], list[str]]:
+    def dataset(self) -> tuple[list[Path], dict[str, str]]:
         """Run the missing points of the figures `COLLECTED`, and write their recalls as one archive, dataset-SCALE.zip.
 
         Returns:
-            The files written, and the reasons of points that failed.
+            The files written, and the reasons of points that failed, by key.
         """
         require_x64()
         store = self._run(spec_for_all(COLLECTED, self.scale)).store
@@ -232,7 +232,7 @@ class Reproduction:
         runner = self._run(spec)
         store = runner.store
         if failed := _failed(store):
-            raise RunFailedError(failed[0])
+            raise RunFailedError(next(iter(failed.values())))
         points, many = store.card()["points"], scale_of(self.scale).packs
         made = [runner.pack_of({**spec.shared, **row["values"]}) for row in (points[0], *points[1 - 2 * many :])]
         tetra, spheres = made[:many], made[many:]
@@ -309,10 +309,10 @@ def _written(target: Path) -> list[Path]:
     return [target.with_suffix(suffix) for suffix in (".png", ".svg", ".csv")]
 
 
-def _failed(store: Store) -> list[str]:
-    """The reasons of all failed points of the latest sweep."""
+def _failed(store: Store) -> dict[str, str]:
+    """The reasons of all failed points of the latest sweep, by key; rows of equal values are one point."""
     failed = store.failed()
-    return sorted(failed[row["key"]] for row in store.card()["points"] if failed.get(row["key"]))
+    return {row["key"]: failed[row["key"]] for row in store.card()["points"] if failed.get(row["key"])}
 
 
 def _draw(
@@ -367,4 +367,9 @@ def outcome_summary(outcome: Outcome[Compared]) -> dict[str, Any]:
         }
         for row in outcome.rows
     ]
-    return {"figure": outcome.name, "rows": lines, "files": list(map(str, outcome.files)), "failed": outcome.failed}
+    return {
+        "figure": outcome.name,
+        "rows": lines,
+        "files": list(map(str, outcome.files)),
+        "failed": sorted(outcome.failed.values()),
+    }

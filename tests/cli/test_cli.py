@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from importlib import metadata
@@ -179,6 +180,16 @@ def test_recalled_words_are_classified_and_the_nets_are_used_again(
     assert "nearest template" in capsys.readouterr().out
 
 
+def test_the_picture_of_a_reading_never_takes_the_place_of_its_recall(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path, one_bit: Path
+) -> None:
+    recall = tmp_path / "read.png"
+    shutil.copy(one_bit, recall)
+    assert gmem(monkeypatch, "classify", recall, "-o", tmp_path / "read.json", "--force") == 2
+    assert "read.png: is an input of this command" in capsys.readouterr().err
+    assert recall.read_bytes() == one_bit.read_bytes()
+
+
 @pytest.mark.parametrize("begun", [False, True])
 def test_an_interrupted_training_says_where_it_goes_on(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path, one_bit: Path, begun: bool
@@ -287,6 +298,7 @@ BAD = [
     (["reproduce", "fig08", "-o", "/proc/rep"], "--output /proc/rep: cannot write there"),
     (["reproduce", "fig08", "-o", "x" * 252], "cannot write there (File name too long)"),
     (["reproduce", "fig05", "-o", "{pack}"], "is a file, and a folder is needed; name another"),
+    (["reproduce", "fig05", "-o", "{pack}", "--dry-run"], "is a file, and a folder is needed; name another"),
     (["classify", "{pack}", "-o", "{json}"], "this is a pack; a recall is needed"),
     (["classify", "{truncated.h5}", "-o", "{json}"], "its checksum does not fit its content"),
     (["classify", "nothing.h5", "-o", "{json}"], "nothing.h5: no such file"),
@@ -320,6 +332,21 @@ def test_bad_input_gets_one_clear_line_exit_code_2_and_leaves_nothing(
     assert len(said.err.strip().splitlines()) == 1
     assert words in said.err
     assert list(outputs.iterdir()) == []
+
+
+def test_reproduce_replaces_its_own_pictures_and_no_others(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    picture, nets = tmp_path / "fig05.png", tmp_path / "nets"
+    for taken, told in ((picture, "is not of this command"), (nets, "is a file, and a folder is needed; move it away")):
+        taken.write_text("mine")
+        assert gmem(monkeypatch, "reproduce", "fig05", "-o", tmp_path) == 2
+        assert f"{taken}: {told}" in capsys.readouterr().err
+        assert taken.read_text() == "mine"
+        taken.unlink()
+    for _ in range(2):
+        assert gmem(monkeypatch, "reproduce", "fig05", "-o", tmp_path) == 0
+        assert picture.is_file()
 
 
 def test_a_run_that_breaks_down_exits_with_1(

@@ -191,6 +191,7 @@ REFUSED = {
     "neither a sweep file": ["sweep", "recall.h5"],
     "no such figure": ["reproduce", "fig99"],
     "a scale has no field to set by": ["reproduce", "fig06", "--scale", "paper,size=3"],
+    "t0 is given twice": ["reproduce", "fig06", "--scale", "laptop,t0=50,t0=60"],
     "should read like timeout_min=240": ["reproduce", "fig06", "--option", "timeout_min"],
     "no option 'mem_gb'": ["reproduce", "fig06", "--option", "mem_gb=1.5"],
     "no option 'timeout_min'": ["reproduce", "fig06", "--dry-run", "--option", "timeout_min=240"],

@@ -128,7 +128,7 @@ def test_an_unknown_pack_name_lists_the_shipped_ones() -> None:
 def test_a_place_where_no_file_can_be_is_named_as_it_was_given(tmp_path: Path) -> None:
     for place, told in (
         ("none/a.csv", r"none/a\.csv: folder .*none does not exist$"),
-        ("", ": is a folder; name a file"),
+        ("", ": is a folder, and a file is needed; move it away"),
     ):
         with pytest.raises(OSError, match=told):
             gm.save_waveforms(tmp_path / place, gm.six_signals())

@@ -4,6 +4,7 @@ import csv
 import hashlib
 import json
 import math
+import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -218,9 +219,12 @@ def test_a_figure_is_run_drawn_tabled_and_not_run_again(monkeypatch: pytest.Monk
         monkeypatch.setitem(FIGURES, name, PaperFigure("none", lambda scale: []))
     # mu = 1 is what holds where nothing is said: the same point, which is in the archive once.
     monkeypatch.setitem(FIGURES, "fig09", PaperFigure("as it is", lambda scale: [{"pack": PACK}]))
+    store = Store(tmp_path / "runs")
+    for key in store.done():  # files may come from a machine with a wrong clock
+        os.utime(store.at(key), (0, 0))
     (archive,), failed = Reproduction(tmp_path, "tiny", Here(), say=said.append).dataset()
     told = ["nothing to do: 2 of 2 points there", f"warning: 2 of 2 points: {doubt}"]
-    assert (archive.name, failed, said) == ("dataset-tiny.zip", [], told)
+    assert (archive.name, failed, said) == ("dataset-tiny.zip", {}, told)
     shutil.unpack_archive(archive, tmp_path / "data")
     with (tmp_path / "data" / "points.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -235,6 +239,13 @@ def test_a_figure_is_run_drawn_tabled_and_not_run_again(monkeypatch: pytest.Monk
     told = (tmp_path / "data" / "README.md").read_text()
     assert "These are 2 such experiments" in told
     assert rows[0]["file"] in told
+    key = Path(rows[0]["file"]).stem  # the point of two figures
+    store.forget(key)
+    store.fail(key, "escaped")
+    (archive,), failed = Reproduction(tmp_path, "tiny", Here(), say=said.append).dataset()
+    assert failed == {key: "escaped"}
+    shutil.unpack_archive(archive, tmp_path / "less")
+    assert "Missing: 1 more point, whose runs failed" in (tmp_path / "less" / "README.md").read_text()
 
 
 def test_only_what_was_written_is_said_to_be(tmp_path: Path) -> None:
