@@ -74,7 +74,7 @@ def errors(experiment: gm.Experiment, name: str, slope: Any) -> tuple[float, flo
     found: list[float] = []
     forward: list[float] = []
     for seed in range(DIRECTIONS):
-        toss = np.random.default_rng(seed).normal(size=value.shape) * (np.abs(value).mean() + 1e-3)
+        toss: Any = np.random.default_rng(seed).normal(size=value.shape) * (np.abs(value).mean() + 1e-3)
         toss = np.where(value == 0.0, 0.0, toss) if name == "signals.nodes" else toss  # a waveform vanishes at its ends
         changed = [gm.replace(experiment, {name: jnp.asarray(value + by * toss)}) for by in (STEP, -STEP)]
         up, down = (float(score(one, gm.run(one, progress=False).p_sig)) for one in changed)

@@ -197,6 +197,8 @@ def build(target: Path) -> None:
 
 
 if __name__ == "__main__":
+    if set(sys.argv[1:]) - {"--if-stale"}:
+        sys.exit(__doc__)
     try:
         if "--if-stale" not in sys.argv or opened(HERE / LIBRARY)[0] is None:
             build(HERE / LIBRARY)

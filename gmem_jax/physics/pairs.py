@@ -182,7 +182,7 @@ def tabulate(
     found = found.astype(np.int32)
     # In the row of a sphere stand first the contacts whose sphere i it is, then the others, both in the list's order.
     as_first, as_second = (np.bincount(side, minlength=count).astype(np.int32) for side in found)
-    per_sphere = -(-max(1, per_sphere, (as_first + as_second).max(initial=0)) // 4) * 4
+    per_sphere = -(-max(1, per_sphere, int((as_first + as_second).max(initial=0))) // 4) * 4
     incidence = np.full((count, per_sphere), 2 * capacity, dtype=np.int32)
     rows = np.arange(pairs, dtype=np.int32)
     # The columns of a sparse matrix are a stable sort by the second sphere, made by counting instead of comparing.
