@@ -148,7 +148,8 @@ def stack(packs: Sequence[Pack]) -> Pack:
         ValueError: if there is no pack, they differ in one of these, or one is not in double precision.
     """
     if isinstance(packs, Pack) or not isinstance(packs, Iterable):
-        raise ValueError(f"stack takes several packs, in a list: got {said(packs)}")
+        given = packs.name if isinstance(packs, Pack) else said(packs)
+        raise ValueError(f"stack takes several packs, in a list: got {given}")
     packs = tuple(packs)
     if not packs:
         raise ValueError("stack needs at least one pack")
