@@ -156,6 +156,7 @@ def at_the_papers_rate() -> dict[Conditions, str]:
     for name in SLOW:
         for at, row in rows_of(HERE / name):
             own = not int(row["status"]) & Status.OTHER_COMPRESSION and row["pack"] not in CALIBRATED
+            own &= float(row.get("cycled_at", PAPER_T0)) == PAPER_T0  # F depends on it: see differences.md
             if at.grains == GRAINS and float(row["t0"]) == PAPER_T0 and own:
                 run = row["pack"], float(row.get("G_over_T1", row["G"])), float(row["F_over_T1"])
                 runs.setdefault((at, float(row["pressure"])), set()).add(run)
