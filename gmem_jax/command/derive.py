@@ -15,7 +15,6 @@ from gmem_jax.command.console import (
     PackName,
     Picture,
     announce,
-    check_output,
     draw_beside,
     print_result,
     refuse_idle,
@@ -283,17 +282,16 @@ def design_command(
     if words is not None:
         refuse_idle("beside --words, which says what they are", "signals")
     chosen = chosen if words is None else chosen.with_signals(f"words:{words}")
-    (experiment,), drawn = chosen.check_output([pack], output, ".csv", picture=picture, force=force)
+    if start is not None and not start.is_file():
+        raise InputError(f"--start {start}: is no file of waveforms")
+    history, read = output.with_name(f"{output.stem}-history.png"), () if start is None else (start,)
+    (experiment,), drawn = chosen.check_output(
+        [pack], output, ".csv", picture=picture, force=force, inputs=read, pictures=(history,)
+    )
     _require_one_fidelity(experiment)
     _require_designable(experiment)
     if chosen.target(experiment.signals.count) is not None:
         raise InputError("--signals: these are designed waveforms; give the wanted ones, and these as --start to go on")
-    if start is not None and not start.is_file():
-        raise InputError(f"--start {start}: is no file of waveforms")
-    history, given = output.with_name(f"{output.stem}-history.png"), (pack,) if start is None else (pack, start)
-    check_output(output, ".csv", inputs=given, force=force)
-    for path in (drawn, history) if drawn else ():
-        check_output(path, ".png", inputs=given, force=force)
     began = time.perf_counter()
     count = experiment.signals.count
     by = by or ("kernel" if words is not None or count > MANY else "jacobian")

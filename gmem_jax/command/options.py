@@ -91,9 +91,26 @@ class ExperimentOptions:
         return ExperimentOptions({**self._values, "signals": name})
 
     def check_output(
-        self, packs: Sequence[str], output: Path, suffix: str, *, picture: bool, force: bool
+        self,
+        packs: Sequence[str],
+        output: Path,
+        suffix: str,
+        *,
+        picture: bool,
+        force: bool,
+        inputs: Sequence[Path] = (),
+        pictures: Sequence[Path] = (),
     ) -> tuple[list[Experiment], Path | None]:
         """Make the experiments on some packs, and make sure that the output and the picture beside it can be written.
+
+        Args:
+            packs: pack files, or shipped packs.
+            output: the file to write.
+            suffix: the suffix that its name must have.
+            picture: whether pictures are drawn.
+            force: whether files that exist may be replaced.
+            inputs: further files that the command reads.
+            pictures: further pictures that it draws.
 
         Raises:
             ValueError: for impossible values, or an output that would destroy something.
@@ -101,10 +118,11 @@ class ExperimentOptions:
         """
         experiments = [self.experiment(pack) for pack in packs]
         of_sets = [file for _, file in sets_named(self._values["signals"])]
-        inputs = (*packs, *self._inputs, *of_sets)
-        check_output(output, suffix, inputs=inputs, force=force)
-        drawn = check_output(output.with_suffix(".png"), ".png", inputs=inputs, force=force) if picture else None
-        return experiments, drawn
+        read = (*packs, *self._inputs, *of_sets, *inputs)
+        check_output(output, suffix, inputs=read, force=force)
+        every = (output.with_suffix(".png"), *pictures) if picture else ()
+        drawn = [check_output(path, ".png", inputs=read, force=force) for path in every]
+        return experiments, drawn[0] if drawn else None
 
     def target(self, count: int) -> Signals | None:
         """The target of the design of the `count` chosen waveforms; None if they were not designed.

@@ -44,6 +44,11 @@ def test_a_design_goes_on_from_a_file(
     gm.save_waveforms(waves, gm.waveform(np.outer(np.ones(6), samples)))
     assert gmem(monkeypatch, "design", PACK, "--start", waves, *SHORT) == 2
     assert "--start: designs by Jacobians have no use for it" in capsys.readouterr().err
+    taken = tmp_path / "next-history.png"  # the name of a picture that the command would draw
+    taken.write_bytes(waves.read_bytes())
+    assert gmem(monkeypatch, "design", PACK, "--start", taken, "-o", tmp_path / "next.csv", "--force", *SHORT) == 2
+    assert "next-history.png: is an input of this command" in capsys.readouterr().err
+    taken.unlink()
     on = ["design", PACK, "--by", "kernel", "--bumps", 5, "--width", 0.4, "--iterations", 1, "--no-picture", *SHORT]
     assert gmem(monkeypatch, *on, "--start", few) == 2
     assert "1 waveform to start from, for 6 signals; give one for each" in capsys.readouterr().err
