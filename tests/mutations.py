@@ -1314,9 +1314,16 @@ MUTATIONS = (
         "test_a_runner_that_foresees_throws_no_chunk_away",
     ),
     mutation(
+        "slow-grains-taken-for-unstable-steps",
+        "simulation/runner.py",
+        "(LARGEST_SKIN if speed < FAST else WIDE_SKIN)",
+        "WIDE_SKIN",
+        "test_grains_that_fly_far_in_a_long_bin_break_a_run_only_if_they_are_fast",
+    ),
+    mutation(
         "stale-chunk-stands",
         "simulation/runner.py",
-        "            self._renew_stale(chunk)\n            return\n",
+        "            self._renew_stale(chunk, float(np.max(to_host(sample.largest_speed))))\n            return\n",
         "            status &= ~int(Status.STALE_PAIRS)\n",
         "test_a_list_that_goes_stale_is_rebuilt_and_its_chunk_redone_with_the_same_result",
     ),

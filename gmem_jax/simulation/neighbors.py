@@ -15,7 +15,9 @@ from gmem_jax.physics.system import System
 SKIN = 0.3
 """Skin of the neighbour list of an experiment, in R. Measured non-affine displacements over a full compression stay
 below 0.11 R at N = 325 to 3267, so one list serves a whole experiment; the margin covers the shear and a repeat."""
-LARGEST_SKIN = 2.0  # skin beyond which a list that goes stale within a bin is a broken run
+WIDE_SKIN = 2.0  # R. A run whose list goes stale within a bin is broken beyond this skin if grains are fast,
+LARGEST_SKIN = 6.0  # and beyond this one in any case: a frictionless grain in its cage may move by R in a long bin
+FAST = 0.1  # R / t_c; of 3,267 frictionless grains in slow cycles the fastest had 0.01, those of unstable steps pass 1
 
 
 def pair_finder(clump: Clump, extent: np.ndarray, skin: float, **sizes: Any) -> PairFinder:

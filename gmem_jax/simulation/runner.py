@@ -20,7 +20,7 @@ from gmem_jax.physics.state import Box, State, Status, combined_status, explain
 from gmem_jax.simulation.checkpoints import NO_CHECKPOINT, Checkpoint, ResultCache
 from gmem_jax.simulation.compiled import Compiled
 from gmem_jax.simulation.loop import Mark, Simulation
-from gmem_jax.simulation.neighbors import LARGEST_SKIN, SKIN, pair_finder, skin_left
+from gmem_jax.simulation.neighbors import FAST, LARGEST_SKIN, SKIN, WIDE_SKIN, pair_finder, skin_left
 from gmem_jax.simulation.observers import CHUNK, CheckpointWriter, Chunk, Observer, SampleRecorder
 from gmem_jax.simulation.progress import Progress, silent, work_of_bin
 from gmem_jax.simulation.sample import Sample
@@ -194,7 +194,7 @@ class Runner:
         state, sample = own[0] if own else chunk.run()
         status = status_of(state)
         if status & Status.STALE_PAIRS:
-            self._renew_stale(chunk)
+            self._renew_stale(chunk, float(np.max(to_host(sample.largest_speed))))
             return
         raise_if_fatal(status, stage.name, self.simulation)
         for observer in observers:
@@ -242,10 +242,14 @@ class Runner:
             self._renewed_at = (stage.name, self.time)
             self.renew(box)
 
-    def _renew_stale(self, chunk: Chunk) -> None:
+    def _renew_stale(self, chunk: Chunk, speed: float) -> None:
         """Renew a stale list before its chunk is redone; if that was just done, shorten the chunk or widen the skin.
 
         Frictionless grains turn and fly freely in their cages: the skin that a list needs grows with the time it lasts.
+
+        Args:
+            chunk: the chunk that ended with a stale list.
+            speed: largest speed of a grain in it, in R / t_c.
         """
         if self._renewed_at == (chunk.stage.name, self.time):
             if self.chunk > 1:
@@ -253,7 +257,7 @@ class Runner:
                 return
             self.skin *= 1.5
             self.finder = None
-            if self.skin > LARGEST_SKIN:
+            if self.skin > (LARGEST_SKIN if speed < FAST else WIDE_SKIN):
                 why = cause(self.simulation)
                 why = why or "the steps are unstable; use a smaller dt, or check pack and friction law"
                 raise RunFailedError(f"{chunk.stage.name}: grains moved by most of R within one bin: {why}")

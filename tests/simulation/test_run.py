@@ -11,7 +11,7 @@ from scenes import TETRA_27
 
 import gmem_jax as gm
 from gmem_jax.physics.search import PairFinder
-from gmem_jax.physics.state import State, Status, combined_status
+from gmem_jax.physics.state import Grains, State, Status, combined_status, still_box
 from gmem_jax.physics.step import start
 from gmem_jax.physics.system import System
 from gmem_jax.simulation import stability
@@ -51,6 +51,27 @@ def test_a_list_that_goes_stale_is_rebuilt_and_its_chunk_redone_with_the_same_re
     assert narrow.rebuilds >= 1
     # The same contacts in the same order; only sums over a wider padded table may round differently.
     np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+# Two spheres, 10 R apart, fly by 2 R in a bin: their list needs a skin of 4 R.
+@pytest.mark.parametrize(("speed", "whole"), [(0.05, True), (0.2, False)])
+def test_grains_that_fly_far_in_a_long_bin_break_a_run_only_if_they_are_fast(speed: float, whole: bool) -> None:
+    clump, half = gm.sphere(), jnp.full((3, 1), 20.0)
+    at = jnp.asarray([[-5.0, 0.0, 0.0], [5.0, 0.0, 0.0]])[..., None]
+    turned = jnp.asarray([[1.0, 0.0, 0.0, 0.0]] * 2)[..., None]
+    box, still = still_box(-half, half), jnp.zeros_like(at)
+    grains = Grains(at, turned, jnp.full_like(at, speed / np.sqrt(3.0)), still, still, still)
+    system = System(clump, gm.Frictionless(), PairFinder(clump, np.full(3, 40.0), 0.3)(grains, clump, box))
+    simulation = Simulation(system, StrainPath(-half, half, 0.05), 2.0 / (speed * 200), steps=200)
+    runner = Runner(simulation, replace(start(system, at, turned, box), grains=grains))
+    rest = Stage("rest", 0.0, 0.0, 1 / 256, "hold")
+    if not whole:
+        with pytest.raises(gm.RunFailedError, match="rest: grains moved by most of R within one bin"):
+            runner.run_stages(rest)
+        return
+    runner.run_stages(rest)
+    np.testing.assert_allclose(runner.state.grains.position, at + 2.0 / np.sqrt(3.0), rtol=1e-9)
+    assert runner.skin > 4.0
 
 
 class Counted(Observer):
