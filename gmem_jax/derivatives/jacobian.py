@@ -15,7 +15,7 @@ from gmem_jax.derivatives.push import push
 from gmem_jax.experiment.arguments import require_kind
 from gmem_jax.experiment.asked import require_host
 from gmem_jax.experiment.changes import replace, value_at
-from gmem_jax.experiment.experiment import Experiment, replica_parameters
+from gmem_jax.experiment.experiment import Experiment, require_one_value
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.run import run
 from gmem_jax.experiment.signals import Bumps
@@ -62,8 +62,7 @@ def _one_signal(experiment: Experiment) -> tuple[Bumps, np.ndarray]:
         raise ValueError(f"a Jacobian is taken with the background sub0, got {experiment.background}")
     if len(experiment.readings.reads) * len(experiment.readings.channels) > 1:
         raise ValueError("a Jacobian is taken of one read and one channel")
-    if any(map(jnp.ndim, replica_parameters(experiment).values())):
-        raise ValueError("a Jacobian is taken at one value of each parameter, not one for each replica")
+    require_one_value("a Jacobian is taken", experiment)
     law = type(experiment.friction).__name__
     for name, path in LAW.items():
         value = getattr(experiment.friction, path.removeprefix("friction."), None)

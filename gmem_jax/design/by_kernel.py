@@ -17,14 +17,14 @@ from gmem_jax.design.waveforms import (
     bounded,
     correction,
     largest,
-    refuse_several_scales,
+    require_damping,
     require_gain,
     sampled,
     verified,
 )
 from gmem_jax.experiment.arguments import require_kind
 from gmem_jax.experiment.changes import with_signals
-from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.experiment.experiment import Experiment, require_one_value
 from gmem_jax.experiment.run import PREFIX, prefix_of, run
 from gmem_jax.experiment.signals import Signals, Spline
 from gmem_jax.physics.numbers import plural, require_numbers, require_whole
@@ -54,7 +54,8 @@ def kernel_design_cost(
     experiment: Experiment, iterations: int | None = None, n: int = KERNEL_BUMPS, measured: int = 0
 ) -> float:
     """The cost of a design, in runs of all its signals."""
-    return (iterations or KERNEL_ITERATIONS) + 2.0 + 2.0 * n / experiment.signals.count + len(SLOPES_AT) * measured
+    runs = KERNEL_ITERATIONS if iterations is None else max(1, iterations)
+    return runs + 2.0 + 2.0 * n / experiment.signals.count + len(SLOPES_AT) * measured
 
 
 def shares(runs: int, needs: np.ndarray, most: int) -> np.ndarray:
@@ -121,21 +122,22 @@ def design_by_kernel(
         progress: see `run`.
 
     Raises:
-        ValueError: if the kernel was measured at another gamma0 or delta0, either differs between replicas, `start` has
-            another number of waveforms than there are signals, or there are several reads or channels.
+        ValueError: if the kernel was measured at another gamma0 or delta0, a parameter differs between replicas,
+            `start` has another number of waveforms than there are signals, or there are several reads or channels.
         RunFailedError: if a simulation broke down.
     """
     require_kind("design_by_kernel", experiment, Experiment)
     tell = callback(progress)
-    refuse_several_scales(experiment)
+    require_one_value("waveforms are designed", experiment)
     if len(written_sets(experiment)) > 1:
         raise ValueError(
             "a design by a kernel needs an experiment with one channel; gm.design_waveforms designs several together"
         )
     count = experiment.waveforms.count
-    iterations, n = require_whole("iterations", iterations), require_whole("n", n, 1)
+    iterations, n = require_whole("iterations", iterations), require_whole("n", n, 2)
     measured = require_whole("measured", measured)
     require_numbers(width=width, gain=gain, damping=damping)
+    require_damping(damping)
     require_gain(gain)
     if start is not None and start.count != count:
         raise ValueError(

@@ -15,7 +15,7 @@ import numpy as np
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.arguments import require_kind
 from gmem_jax.experiment.changes import replace
-from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.experiment.experiment import Experiment, require_one_value
 from gmem_jax.experiment.run import Prefix, run
 from gmem_jax.experiment.signals import Bumps, Signals, bin_average, signals
 from gmem_jax.physics.numbers import plural, require_numbers, require_whole
@@ -182,7 +182,7 @@ def memory_kernel(
         progress: see `run`.
 
     Raises:
-        ValueError: if n < 2, gamma0 or delta0 differs between replicas, the background is not sub0, or there are
+        ValueError: if n < 2, a parameter differs between replicas, the background is not sub0, or there are
             several reads or channels.
         RunFailedError: if the simulation broke down.
     """
@@ -206,8 +206,7 @@ def _basis(experiment: Experiment, n: int, width: float) -> Bumps:
         raise ValueError(
             f"a kernel is measured with background 'sub0', since with {experiment.background!r} silence has a recall"
         )
-    if jnp.ndim(experiment.scale):
-        raise ValueError("a kernel is measured at one gamma0 and one delta0, not one for each replica")
+    require_one_value("a kernel is measured", experiment)
     return bumps(np.concatenate([np.eye(n), -np.eye(n)]), width)
 
 
@@ -261,7 +260,7 @@ def kernel_matrix(
         progress: see `run`.
 
     Raises:
-        ValueError: if n < 2, gamma0 or delta0 differs between replicas, the background is not sub0, there are several
+        ValueError: if n < 2, a parameter differs between replicas, the background is not sub0, there are several
             reads, or not a set of waveforms for each channel.
         RunFailedError: if the simulation broke down.
     """

@@ -18,10 +18,10 @@ from gmem_jax.derivatives.push import push
 from gmem_jax.design.kernel import QUADRATURE_POINTS, bumps, nearest, written_sets
 from gmem_jax.experiment.arguments import require_kind
 from gmem_jax.experiment.changes import replace
-from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.experiment.experiment import Experiment, require_one_value
 from gmem_jax.experiment.run import prefix_of, run
 from gmem_jax.experiment.signals import Bumps, Signals, Spline, signals, waveform
-from gmem_jax.physics.numbers import require_numbers, require_whole
+from gmem_jax.physics.numbers import require_numbers, require_whole, said
 from gmem_jax.physics.pytree import comparable, short_repr
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.checkpoints import ResultCache, no_cache
@@ -150,22 +150,13 @@ class Work:
 
 def cost(experiment: Experiment, iterations: int | None = None, n: int = BUMPS) -> float:
     """The cost of a design, in runs of all its signals."""
-    return 3.0 + 2.0 * _prefix(experiment) + (iterations or ITERATIONS) * (TANGENT * n + len(FRACTIONS))
+    corrections = ITERATIONS if iterations is None else iterations
+    return 3.0 + 2.0 * _prefix(experiment) + corrections * (TANGENT * n + len(FRACTIONS))
 
 
 def _prefix(experiment: Experiment) -> float:
     common, own = (sum(stage.bins for stage in some) for some in experiment.phases)
     return common / (own * experiment.replicas)
-
-
-def refuse_several_scales(experiment: Experiment) -> None:
-    """Refuse an experiment that has not one gain.
-
-    Raises:
-        ValueError: if gamma0 or delta0 differs between replicas.
-    """
-    if jnp.ndim(experiment.scale):
-        raise ValueError("waveforms are designed at one gamma0 and one delta0, not one for each replica")
 
 
 def require_gain(gain: float | None) -> None:
@@ -178,6 +169,16 @@ def require_gain(gain: float | None) -> None:
         raise ValueError(f"gain must be a finite number other than 0, got {gain:g}")
 
 
+def require_damping(*damping: float) -> None:
+    """Refuse no damping at all, and one that no correction can have.
+
+    Raises:
+        ValueError: if there is none, or one is negative, infinite or not a number.
+    """
+    if not damping or not all(0.0 <= one < math.inf for one in damping):
+        raise ValueError(f"damping must be finite numbers >= 0, one at least; got {said(damping)}")
+
+
 @usual_rules()
 @shows_progress
 def design_waveforms(
@@ -187,7 +188,7 @@ def design_waveforms(
     n: int = BUMPS,
     width: float = BUMP_WIDTH,
     gain: float | None = None,
-    damping: Sequence[float] = DAMPING,
+    damping: float | Sequence[float] = DAMPING,
     cache: ResultCache = no_cache,
     progress: ProgressChoice = None,
 ) -> Design:
@@ -204,21 +205,23 @@ def design_waveforms(
         gain: wanted gain G; default half of the gain of the original waveforms on each channel, so that the bound
             |I| <= 1 leaves room.
         damping: damping of each correction, relative to the largest singular value of the Jacobian; the last is used
-            for all that follow.
+            for all that follow, and a number for all.
         cache: see `run`; it keeps every simulation and Jacobian.
         progress: see `run`.
 
     Raises:
-        ValueError: if gamma0 or delta0 differs between replicas, there are several reads, a channel has no set of
+        ValueError: if a parameter differs between replicas, there are several reads, a channel has no set of
             waveforms of its own, or the precision is mixed.
         RunFailedError: if a simulation broke down.
     """
     require_kind("design_waveforms", experiment, Experiment)
     require_derivatives(experiment)
     tell = callback(progress)
-    refuse_several_scales(experiment)
-    iterations, n = require_whole("iterations", iterations), require_whole("n", n, 1)
-    require_numbers(width=width, gain=gain, **{f"damping {number}": one for number, one in enumerate(damping, 1)})
+    require_one_value("waveforms are designed", experiment)
+    iterations, n = require_whole("iterations", iterations), require_whole("n", n, 2)
+    dampings = (damping,) if isinstance(damping, float | int) else tuple(damping)
+    require_numbers(width=width, gain=gain, **{f"damping {number}": one for number, one in enumerate(dampings, 1)})
+    require_damping(*dampings)
     require_gain(gain)
     names = written_sets(experiment)
     work, share = Work(cost(experiment, iterations, n * len(names)), tell), _prefix(experiment)
@@ -272,7 +275,7 @@ def design_waveforms(
     history = [float(np.mean(original.fidelity))]
     for iteration in range(iterations):
         local = jacobians(f"jacobian-{iteration}", amplitudes)
-        damped = damping[min(iteration, len(damping) - 1)]
+        damped = dampings[min(iteration, len(dampings) - 1)]
         steps = correction(local, wanted - p_sig, damped * np.linalg.norm(local, 2, axis=(1, 2))[:, None])
         tried = [within_bounds(amplitudes + fraction * steps) for fraction in FRACTIONS]
         candidates = np.stack([amplitudes, *tried])

@@ -504,3 +504,14 @@ def replica_parameters(experiment: Experiment) -> dict[str, Any]:
     of_law = {f"friction.{field.name}": getattr(law, field.name) for field in fields(law)} if is_dataclass(law) else {}
     numbers = {**own, **of_law}
     return {name: value for name, value in numbers.items() if isinstance(value, float | np.ndarray | jax.Array)}
+
+
+def require_one_value(what: str, experiment: Experiment) -> None:
+    """Refuse parameters that differ between replicas; `what` begins the message, as "a kernel is measured".
+
+    Raises:
+        ValueError: naming the first of them.
+    """
+    for name, value in replica_parameters(experiment).items():
+        if jnp.ndim(value):
+            raise ValueError(f"{what} at one value of each parameter, not one for each replica as {name} has")

@@ -230,6 +230,29 @@ def test_a_gain_that_no_waveform_has_is_refused_before_anything_runs(
         design(experiment, gain=gain, progress=told)
 
 
+@pytest.mark.parametrize(
+    ("changed", "asked", "words"),
+    [
+        (
+            {"friction": gm.Hooke(mu=np.full(3, 0.5))},
+            {},
+            "one value of each parameter, not one for each replica as friction.mu has",
+        ),
+        ({}, {"n": 1}, "n must be .* 2"),
+        ({}, {"damping": ()}, "damping must be finite numbers >= 0, one at least"),
+        ({}, {"damping": (0.1, math.nan)}, "damping must be finite numbers"),
+    ],
+)
+def test_a_design_that_cannot_be_is_refused_before_anything_runs(
+    changed: dict[str, Any], asked: dict[str, Any], words: str, experiment: gm.Experiment
+) -> None:
+    def told(*_: object) -> None:
+        pytest.fail("it was begun")
+
+    with pytest.raises(ValueError, match=words):
+        gm.design_waveforms(gm.replace(experiment, signals=gm.words(1), **changed), **asked, progress=told)
+
+
 def test_designs_of_what_is_read_twice_are_refused(experiment: gm.Experiment) -> None:
     again = gm.Experiment(experiment.pack, experiment.signals, t0=75.0, protocol=gm.protocols.partial_readout())
     with pytest.raises(

@@ -47,6 +47,18 @@ def test_the_factors_of_bins_make_up_that_of_the_stage(fades: float | None) -> N
     assert slope == pytest.approx(-rate if fades is None else -rate / (1.0 + time / fades), rel=1e-5)
 
 
+@pytest.mark.parametrize("fades", [1e7, 1e9, 1e13, 1e300, np.inf])
+def test_creep_that_hardly_fades_is_that_of_a_maxwell_solid_with_the_slope_of_its_expansion(fades: float) -> None:
+    """log of the factor = -rate (d1 - d2 / (2 tau) + d3 / (3 tau^2) ...), with dn = ended^n - begun^n."""
+    rate, begun, ended = 0.01, 500.0, 507.0
+    d1, d2, d3 = (ended**n - begun**n for n in (1, 2, 3))
+    value, slope = jax.value_and_grad(relaxation, argnums=1)(rate, fades, jnp.asarray(begun), jnp.asarray(ended))
+    expected = np.exp(-rate * (d1 - d2 / (2.0 * fades) + d3 / (3.0 * fades * fades)))
+    assert float(value) == pytest.approx(expected, rel=1e-9)
+    expected *= -rate * (d2 / 2.0 - 2.0 * d3 / (3.0 * fades)) / fades / fades
+    assert float(slope) == pytest.approx(expected, rel=1e-4)
+
+
 def friction(simulation: Any, state: Any) -> jax.Array:
     """Root mean square of the elastic tangential forces, [B]."""
     return jnp.sqrt(jnp.mean(state.history**2, axis=(0, 1)))

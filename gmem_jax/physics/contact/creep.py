@@ -33,4 +33,14 @@ def relaxation(rate: Scalar, fades: Scalar | None, begun: jax.Array, ended: jax.
     """
     if fades is None:
         return jnp.exp(-rate * (ended - begun))
-    return ((1.0 + begun / fades) / (1.0 + ended / fades)) ** (rate * fades)
+    # tau log((1 + ended / tau) / (1 + begun / tau)), without differences of numbers that are nearly equal at large tau
+    slowed = (ended - begun) / (1.0 + begun / fades)
+    return jnp.exp(-rate * slowed * _log_over(slowed / fades))
+
+
+def _log_over(x: jax.Array) -> jax.Array:
+    """log(1 + x) / x for x >= 0, whose value and derivatives keep their digits at small x."""
+    small = x < 1e-4
+    near, far = jnp.where(small, x, 0.0), jnp.where(small, 1.0, x)
+    series = 1.0 - near * (1 / 2 - near * (1 / 3 - near * (1 / 4 - near / 5)))
+    return jnp.where(small, series, jnp.log1p(far) / far)
