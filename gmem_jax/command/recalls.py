@@ -197,7 +197,7 @@ def demo(
         lines.append(
             f"Packs of 325 grains differ: the five that are shipped have G = {gain:.3f} ± {gain_sd:.3f},\n"
             f"F = {fidelity:.3f} ± {fidelity_sd:.3f} (mean ± SD) at this rate (gmem demo --packs all).\n"
-            "Larger ones remember better: 10,240 grains, driven ten times more slowly, have F = 0.901."
+            "Larger ones remember better: 10,240 grains, driven ten times more slowly, have F = 0.900."
         )
     print_result(as_json, result, *lines)
 
