@@ -307,6 +307,9 @@ def draw_beside(picture: Path | None, figure: "Callable[[], Figure]") -> str:
 
     Returns:
         " and FILE", for the line that says what was written; "" if no picture was.
+
+    Raises:
+        RunInterruptedError: on Ctrl-C, saying that the result is there.
     """
     from gmem_jax.show.render_matplotlib import to_matplotlib
 
@@ -314,6 +317,8 @@ def draw_beside(picture: Path | None, figure: "Callable[[], Figure]") -> str:
         return ""
     try:
         to_matplotlib(figure()).save(picture)
+    except KeyboardInterrupt:
+        raise RunInterruptedError(f"the result is written, its picture {picture} is not") from None
     except Exception as error:  # from matplotlib, with the user's fonts and settings
         why = " ".join(str(error).split()) or type(error).__name__
         log(f"warning: {picture}: could not be drawn ({why})", style="yellow")

@@ -161,8 +161,8 @@ def train_net(
             now = time.perf_counter()
             training = replace(new, seconds=before + now - began)
             if checkpoint is not None and now - saved > SAVE_EVERY:
-                kept, saved = training, now
                 save(checkpoint, training)
+                kept, saved = training, now  # after it: what an interrupted save did not keep is saved below
             listener(training)
     finally:  # the last whole round, also where the next was interrupted
         if checkpoint is not None and training is not kept:

@@ -255,6 +255,21 @@ def test_ctrl_c_before_a_run_says_that_nothing_was_written(
     assert "interrupted; nothing was written" in capsys.readouterr().err
 
 
+def test_ctrl_c_while_a_picture_is_drawn_says_that_the_result_is_written(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    def interrupt(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("gmem_jax.show.render_matplotlib.to_matplotlib", interrupt)
+    target = tmp_path / "o.h5"
+    assert gmem(monkeypatch, "recall", PACK, "-o", target, "--t0", "20", "--force") == 130
+    assert f"interrupted; the result is written, its picture {target.with_suffix('.png')} is not" in " ".join(
+        capsys.readouterr().err.split()
+    )
+    assert target.is_file()
+
+
 @pytest.mark.parametrize(("where", "code", "words"), [(">&-", 0, ""), ("> /dev/full", 2, "stdout takes no result (No")])
 def test_a_result_that_stdout_does_not_take(tmp_path: Path, where: str, code: int, words: str) -> None:
     for options in ("", "--json"):
