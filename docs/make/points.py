@@ -11,7 +11,9 @@ and ran at the paper's rate is that of these packs alone.
 """
 
 import csv
+import functools
 import math
+import operator
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -90,6 +92,11 @@ def rows_of(path: Path) -> Iterable[tuple[Conditions, dict[str, Any]]]:
             yield Conditions(*grain, mu, delta0, gamma0, 0, "sub0"), row
 
 
+def _status(rows: Iterable[Mapping[str, Any]]) -> int:
+    """The status bits of all rows."""
+    return functools.reduce(operator.or_, (int(row["status"]) for row in rows))
+
+
 def of_packs(path: Path = OWN) -> list[Compared]:
     """Means over the packs of a table, where G and F are those over the ringing period."""
     groups: dict[Conditions, dict[float, list[dict[str, Any]]]] = {}
@@ -97,9 +104,8 @@ def of_packs(path: Path = OWN) -> list[Compared]:
         groups.setdefault(at, {}).setdefault(float(row["t0"]), []).append(row)
     found = []
     for at, rates in groups.items():
-        status, members = 0, max(rates.items(), key=lambda rate: (len(rate[1]), rate[0]))[1]
-        for member in members:
-            status |= int(member["status"])
+        members = max(rates.items(), key=lambda rate: (len(rate[1]), rate[0]))[1]
+        status = _status(members)
         for measure in "FG":
             found.append(compared(at, measure, [float(member[f"{measure}_over_T1"]) for member in members], status))
     return found
@@ -162,7 +168,7 @@ def wholly_slow() -> dict[Measured, Compared]:
         for measure in "FG" if len(packs) >= ENOUGH else "":
             # At this rate the running mean changes F by 1e-4, and some tables have G without it alone.
             values = [float(row.get(f"{measure}_over_T1", row[measure])) for row in packs.values()]
-            found[at, measure] = compared(at, measure, values, 0)
+            found[at, measure] = compared(at, measure, values, _status(packs.values()))
     return found
 
 
@@ -180,7 +186,6 @@ def at_the_papers_rate() -> dict[Conditions, str]:
     for name in SLOW:
         for at, row in rows_of(HERE / name):
             own = not int(row["status"]) & Status.OTHER_COMPRESSION and row["pack"] not in CALIBRATED
-            own &= name != "standard_points.csv" or float(row["prepare_t0"]) == PAPER_T0  # see differences.md
             if at.grains == GRAINS and float(row["t0"]) == PAPER_T0 and own:
                 run = row["pack"], float(row.get("G_over_T1", row["G"])), float(row["F_over_T1"])
                 runs.setdefault((at, float(row["pressure"])), set()).add(run)
